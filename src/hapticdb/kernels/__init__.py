@@ -1,7 +1,7 @@
 """Kernels: arrays in, arrays out, compiled by numba.
 
-``from hapticdb.kernels import curves`` gives a module that is loaded when something in it is first
-used (`_later`). Kernels themselves import one another by name, at once.
+``from hapticdb.kernels import curves`` gives a lazy module, loaded at its first use (`_later`).
+Kernel modules import one another by name, at once.
 """
 
 from hapticdb.kernels._later import later_modules

@@ -1,7 +1,7 @@
-"""Entries compiled side by side into a set (`_machine_code`): the build hook's work.
+"""Parallel compilation of all entries of a group into a set (`_machine_code`).
 
-numba compiles one function at a time in a process, with any number of threads. Each process takes
-whole modules, whose entries share leaves.
+numba compiles one function at a time in a process, with any number of threads. So worker processes
+take whole modules from a queue: the entries of a module share leaves.
 """
 
 import fcntl
@@ -29,19 +29,19 @@ LONGEST = (
     *("period.loop", "query.refining", "resident.feeling"),
     *("triangles.nearest", "surfaces.distances", "triangles.sweeping"),
 )
-"""Modules whose entries take longest to compile, which come first: 13 s to 2 s of 50."""
+"""Modules with the longest compilation, first in the queue: 13 s to 2 s of 50."""
 PATIENCE = 1200.0
-"""Seconds after which processes that compile are ended. Larger: a slower machine may compile."""
+"""Time limit of compiling processes, seconds. Larger: slower machines finish."""
 MOST_SETS = 30
-"""Sets that are kept in a folder, the newest ones: 2 MB each."""
+"""Most sets in a folder, 2 MB each; older ones are removed."""
 SERVE = "from hapticdb.kernels._building import serve; serve()"
-"""Python code that a compiling process runs."""
+"""Python code of a compiling process."""
 
 
 def build_set(folder: Path, group: str) -> None:
-    """Compile all entries of a group into a folder, which is there as a whole or not at all.
+    """Compile all entries of a group into a folder, created atomically.
 
-    Raises OSError if that cannot be done here. A second process waits for the first one.
+    Raises OSError if compilation fails. A concurrent process waits at a file lock.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     with folder.with_name(f"{folder.name}.lock").open("w") as lock:
@@ -64,7 +64,7 @@ def build_set(folder: Path, group: str) -> None:
 
 
 def _modules(group: str) -> list[str]:
-    """Modules that define entries of a group, those of `LONGEST` first."""
+    """Modules with entries of a group, those of `LONGEST` first."""
     folder = Path(__file__).parent
     found = {
         ".".join(source.relative_to(folder).with_suffix("").parts)
@@ -76,9 +76,9 @@ def _modules(group: str) -> list[str]:
 
 
 def _compile_into(folder: Path, group: str) -> None:
-    """Compile all entries of a group in a process for each processor; OSError if one fails.
+    """Compile all entries of a group, one process a processor; OSError if one fails.
 
-    They take the numbers of modules, a byte each, from one pipe.
+    Their queue is a pipe of module numbers, a byte each.
     """
     modules, known = _modules(group), level()
     asked, ask = os.pipe()
@@ -90,7 +90,7 @@ def _compile_into(folder: Path, group: str) -> None:
         "NUMBA_CPU_NAME": known.cpu,
         "NUMBA_CPU_FEATURES": known.features,
     }
-    # the package is found in the same place as here, in any working folder
+    # same package as here, in any working folder
     env["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     workers: list[subprocess.Popen[bytes]] = []
     until = time.monotonic() + PATIENCE
@@ -116,7 +116,7 @@ def _compile_into(folder: Path, group: str) -> None:
 
 
 def serve() -> None:
-    """Run a compiling process; its arguments are its parent and the modules."""
+    """Run a compiling process; its arguments are its parent's pid and the modules."""
     parent = int(sys.argv[1])
     while (number := os.read(0, 1)) and os.getppid() == parent:
         module = sys.argv[2 + number[0]]

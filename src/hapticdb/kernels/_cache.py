@@ -1,7 +1,7 @@
-"""The folder in which machine code and tools are kept between processes; found without numba.
+"""Cache folder of machine code and tools, shared by a user's processes; located without numba.
 
-Whoever can write into it has their code run by this process, and so has whoever can replace it or a
-folder above it.
+Permission to write into it, or to replace it or a folder above it, is permission to run code in
+this process.
 """
 
 import atexit
@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 LENT = "HAPTICDB_KERNELS"
-"""Environment variable by which a process gives its own folder to the processes that it starts."""
+"""Environment variable with the temporary folder of a process, for its child processes."""
 
 
 def sources_digest(folder: Path) -> str:
@@ -32,8 +32,8 @@ def sources_digest(folder: Path) -> str:
 def cache_folder() -> Path:
     """Folder under NUMBA_CACHE_DIR or the user's cache, or else under that of temporary files.
 
-    A folder that others could write into or replace is not used, and a warning names it. The last
-    resort is a folder that ends with this process.
+    A folder writable or replaceable by other users is refused with a warning. The last resort is a
+    temporary folder, removed at the end of this process.
     """
     lent = os.environ.get(LENT, "")
     if Path(lent).is_dir() and lent:
@@ -61,10 +61,10 @@ def cache_folder() -> Path:
 
 
 def _fault(folder: Path) -> str | None:
-    """Who else could write into a folder or replace it; None for nobody.
+    """Reason why other users could write into a folder or replace it, or None.
 
-    Every folder above counts, up to the home directory or the root. In one with the sticky bit, as
-    that of temporary files, nobody replaces what is another's.
+    Every folder above counts, up to the home directory or the root. The sticky bit, as of /tmp,
+    protects entries from replacement by other users.
     """
     home = Path(os.path.expanduser("~")).resolve()  # noqa: PTH111 - no error without a home
     for each in (folder, *folder.parents):

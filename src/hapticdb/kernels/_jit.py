@@ -1,8 +1,8 @@
-"""How kernels are compiled: the numba options of this package, here and nowhere else.
+"""Compilation of kernels: the only module with numba options.
 
-An entry is called from Python and declares the types of its arguments, for which its machine code
-is in a set (`_sets`). A leaf is called by kernels only. An entry that is called with other
-types, as those of a user's law, is compiled in place for them, once a process.
+An entry is called from Python, with declared argument types; its machine code for these is in a set
+(`_sets`). For other types, such as a user's law, it is compiled in place, once a process. A leaf is
+called by kernels only.
 """
 
 import os
@@ -49,17 +49,16 @@ class Declared(NamedTuple):
 
 
 ENTRIES: dict[str, Declared] = {}
-"""Entries of the modules that are loaded, by module and name: ``query.grouping.gap_rows``.
+"""Entries of the loaded modules, by module and name: ``query.grouping.gap_rows``.
 
-An entry that is compiled for the distance law, too, has a second name for that, which ends in
-`BY_DISTANCE`.
+The variant of an entry for the distance law has the suffix `BY_DISTANCE`.
 """
 BY_DISTANCE = "@distances"
 
 _ENTRY_OPTIONS: dict[str, Any] = {
     "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": True,
 }  # fmt: skip
-"""Options of entries. `_nrt` is numba's counting of references to arrays."""
+"""Options of entries. `_nrt`: numba's reference counts of arrays."""
 _LEAF_OPTIONS: dict[str, Any] = _ENTRY_OPTIONS | {"_nrt": False}
 _BY_ADDRESS: dict[str, Any] = {"_nrt": False, "no_cpython_wrapper": True}
 _BUILDING = os.environ.get(BUILDING, "")
@@ -70,20 +69,20 @@ if _BUILDING:
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped
-    """Type of a NamedTuple whose fields have those types."""
+    """Type of a NamedTuple with fields of those types."""
     return types.BaseTuple.from_types(fields, kind)
 
 
 def record_of(layout: Any, axes: int = 0) -> Any:  # noqa: ANN401 - likewise
-    """Type of an array of records of a layout (`records`): one without axes, or rows of them."""
+    """Type of an array of records of a layout (`records`), of 0 axes or more."""
     return types.Array(from_dtype(layout), axes, "C")
 
 
 class _Kept(NullCache):  # type: ignore[misc]
-    """Machine code of one entry in a set.
+    """Machine code of one entry in a set, as numba's cache of it.
 
-    What is loaded needs none of what numba compiles with, half a second of imports: a process whose
-    kernels are all in a set goes without.
+    Loading does not import numba's compiler, which takes 0.5 s; it is absent from a process with
+    all its kernels in sets.
     """
 
     def __init__(self, name: str) -> None:
@@ -107,7 +106,7 @@ class _Kept(NullCache):  # type: ignore[misc]
         return CompileResult._rebuild(target_context, *pickle.loads(code))  # noqa: S301, SLF001
 
     def save_overload(self, sig: Any, cres: Any) -> None:  # noqa: ANN401 - likewise
-        """Add the machine code of a declared signature to the set that is built."""
+        """Write the machine code of a declared signature to the set under construction."""
         if _BUILDING and (name := self._name_of(sig)):
             part = Path(_BUILDING, f"{name}.{os.getpid()}")
             part.write_bytes(dumps(cres._reduce()))  # noqa: SLF001 - as numba's own cache
@@ -119,11 +118,11 @@ def entry(
     also: Mapping[Any, Any] = MappingProxyType({}),
     by_address: bool = False,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a kernel that Python calls with arguments of those types.
+    """Compile a kernel for calls from Python with arguments of those types.
 
-    `also` declares the signature for the distance law: some types exchanged. The kernel runs
-    without the interpreter lock. by_address: only kernels call it (`hand.calling`), and it makes no
-    arrays.
+    It runs without the interpreter lock. also : replacement of types in the signature for the
+    distance law; by_address : the kernel is called by other kernels only (`hand.calling`) and makes
+    no arrays.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -142,18 +141,18 @@ def entry(
 
 
 def load_entries(module: str = "") -> None:
-    """Load the machine code of every entry of a module, or of all modules that are loaded."""
+    """Load the machine code of every entry of a module, or of all loaded modules."""
     for name, (compiled, signature) in list(ENTRIES.items()):
         if not config.DISABLE_JIT and module in {"", name.rpartition(".")[0]}:
             compiled.compile(signature)
 
 
 def leaf(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:  # noqa: ANN401
-    """Compile a function that only kernels call; LLVM inlines it if it is small.
+    """Compile a function for calls from kernels; LLVM inlines it if it is small.
 
-    It counts no references, so arrays cost nothing, but it can make none (`maker`). A process that
-    builds a set makes no machine code of a leaf alone (`_linking`). Elsewhere a leaf can be called
-    from Python, as tests do. numba gives a literal a type of its own; a leaf is compiled without.
+    It has no reference counts, so passing arrays is free, but it cannot make any (see `maker`).
+    Tests call leaves from Python; a set contains no machine code of a leaf alone (`_linking`).
+    Literal arguments are compiled as their general type, not as numba's literal types.
     """
     compiled = numba.njit(**_LEAF_OPTIONS | more)(function)
     if not config.DISABLE_JIT:
@@ -166,20 +165,20 @@ def leaf(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:  # no
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a leaf that LLVM always inlines."""
+    """Compile a leaf with forced inlining."""
     return leaf(function, forceinline=True)
 
 
 def maker(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a leaf that makes arrays."""
+    """Compile a leaf with array allocation."""
     return leaf(function, _nrt=True)
 
 
 def chosen_by_type(choose: Callable[[type], Callable[..., Any]]) -> Callable[..., Any]:
-    """Make a leaf whose body is chosen by the type of its first argument, a NamedTuple.
+    """Make a leaf with static dispatch on the type of its first argument, a NamedTuple.
 
-    `choose` gives the body, a plain function of the same arguments. numba compiles it into each
-    kernel for the type that the kernel is compiled for, so that the choice costs no time.
+    choose : maps the type to the body, a plain function of the same arguments. numba resolves the
+    choice when it compiles a kernel, so a call costs no branch.
     """
 
     def call(first: Any, *others: Any) -> Any:  # noqa: ANN401

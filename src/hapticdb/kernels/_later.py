@@ -1,6 +1,6 @@
-"""Modules of kernels that are loaded when something in them is first used.
+"""Lazy modules of kernels, loaded at first use.
 
-numba and its decorators take 0.4 s to load, which a listing or a help text need not wait for.
+numba and its decorators take 0.4 s to load; a listing or a help text does without.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from types import ModuleType
 
 
 class _Later(ModuleType):
-    """A kernel module that is loaded when something in it is first used."""
+    """Kernel module loaded at the first access to an attribute."""
 
     def __getattr__(self, name: str) -> object:
         value: object = getattr(import_module(self.__name__), name)
@@ -21,8 +21,7 @@ class _Later(ModuleType):
 def later_modules(package: str, init_file: str) -> Callable[[str], ModuleType]:
     """Make the ``__getattr__`` of a package of kernels.
 
-    The import system asks it for modules that are not loaded yet, as ``from package import module``
-    does.
+    The import system calls it for unloaded modules, in ``from package import module``.
 
     Parameters
     ----------

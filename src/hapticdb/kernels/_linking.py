@@ -1,9 +1,9 @@
-"""How a process that builds a set compiles: each thing once.
+"""Link-time optimization of sets: each leaf is compiled once, and optimized within its entries.
 
-There nothing but entries is called from Python. numba would optimize each function together with
-all that it calls, and emit machine code for it: a leaf five calls below an entry six times. Instead
-an entry links each leaf below it, once, and its own passes inline and optimize them: 50 s of
-processor time for all entries instead of 86.
+By default numba optimizes each function together with all its callees, and emits machine code for
+it: a leaf five calls below an entry is optimized six times. In a process building a set only
+entries are called from Python. So an entry links each leaf below it, once, and its own passes
+inline and optimize them: 50 s of processor time for all entries instead of 86.
 """
 
 from typing import Any
@@ -13,18 +13,18 @@ from numba.core.compiler import Compiler
 
 
 class _Library(JITCodeLibrary):  # type: ignore[misc]  # numba is untyped
-    """Code of a function."""
+    """Code of a function, without optimization on its own."""
 
     def _optimize_functions(self, module: Any) -> None:  # noqa: ANN401 - numba's
-        """Optimize no function alone: an entry's passes do it with all that it calls."""
+        """Skip the passes of one function: an entry's passes cover all its callees."""
         module.data_layout = self._codegen._data_layout  # noqa: SLF001
 
 
 class _LeafLibrary(_Library):
-    """Code of a leaf, for entries alone."""
+    """Code of a leaf, for linking into entries."""
 
     def finalize(self) -> None:
-        """Keep the code for entries."""
+        """Retain the code for linking, without emitting machine code."""
         self._finalized = True
         self._get_module_for_linking()
 
@@ -35,7 +35,7 @@ class _EntryLibrary(_Library):
     _linking_libraries: list[Any]
 
     def finalize(self) -> None:
-        """Link callers before what they call: LLVM leaves out what nothing has called yet."""
+        """Link callers before callees: LLVM drops functions without a caller so far."""
         found: dict[Any, None] = {}
         _add_callees(self._linking_libraries, found)
         self._linking_libraries = list(found)[::-1]
@@ -43,7 +43,7 @@ class _EntryLibrary(_Library):
 
 
 def _add_callees(libraries: list[Any], found: dict[Any, None]) -> None:
-    """Add libraries and those of the leaves below them, each behind all that it calls."""
+    """Add libraries and those of the leaves below them in postorder: callees first."""
     for library in libraries:
         if library not in found:
             if isinstance(library, _LeafLibrary):
@@ -61,9 +61,9 @@ class EntryCompiler(Compiler):  # type: ignore[misc]  # likewise
 
 
 def link_leaves_into_entries() -> None:
-    """Let numba make no machine code but of entries.
+    """Patch numba's compiler in this process to emit machine code of entries only.
 
-    Leaves are all else that it compiles: ours, and its own functions that they call.
+    All other functions are compiled as leaves: ours, and numba's own below them.
     """
     begin = Compiler.__init__
 

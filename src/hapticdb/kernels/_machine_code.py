@@ -1,7 +1,7 @@
-"""What a set of machine code is built for.
+"""Target of a set of machine code: sources, versions and processor level.
 
-A set is a folder with a file for each entry of one group and a manifest: for which sources, numba,
-Python and level of processors it was built, and a digest of each file.
+A set is a folder with a file for each entry of one group and a manifest: its target (digest of the
+sources, numba, Python, level of processors), and a digest of each file.
 """
 
 import hashlib
@@ -19,14 +19,14 @@ import numpy as np
 from hapticdb.kernels._cache import sources_digest
 
 BUILDING = "HAPTICDB_BUILDING"
-"""Environment variable of a process that only compiles: the folder of the set that it adds to."""
+"""Environment variable of a compiling process: folder of the set under construction."""
 
 V3 = (
     "avx avx2 bmi bmi2 cx16 cx8 f16c fma fxsr lzcnt mmx movbe popcnt sahf sse sse2 sse3 sse4.1 "
     "sse4.2 ssse3 xsave"
 )
 LEVELS = {"x86_64": ("x86-64-v3", V3), "aarch64": ("generic", "fp-armv8 neon")}
-"""LLVM's name of the processors that a shipped set runs on, and what they have, by architecture.
+"""Processor level of shipped sets: LLVM's name and features, by architecture.
 
 More than x86-64-v3 gains nothing: a frame by the plane law takes 110.5 us with it and 110.3 with
 AVX-512, by the distance law 474 and 487.
@@ -34,11 +34,11 @@ AVX-512, by the distance law 474 and 487.
 
 
 GROUPS = "frames", "session", "triangles"
-"""Groups of entries that are built together: who only imports and touches waits for the first."""
+"""Groups of entries built together. Imports and queries need the first group only."""
 
 
 def group_of(entry: str) -> str:
-    """Group of an entry or a module, by its room: ``period.loop`` is of a session."""
+    """Group of an entry or a module, by its package: ``period.loop`` is in ``session``."""
     room = entry.partition(".")[0]
     if room == "triangles":
         return room
@@ -63,7 +63,7 @@ def level() -> Level:
 
 @cache
 def built_for() -> dict[str, str]:
-    """What a set must have been built for to fit here."""
+    """Target of this process: a set with an equal one fits."""
     cpu, features = level()
     return {
         "numba": numba.__version__,
@@ -78,12 +78,12 @@ def built_for() -> dict[str, str]:
 
 @cache
 def build() -> str:
-    """Digest of sources, compiler and level of processors: equal ones, equal bits."""
+    """Digest of the target, 16 hex digits; equal digests imply equal bits of results."""
     return hashlib.sha256(json.dumps(built_for()).encode()).hexdigest()[:16]
 
 
 def manifest_of(folder: Path) -> dict[str, dict[str, str]]:
-    """Manifest of a set: what it is ``for``, and digests of its ``entries``; empty for none."""
+    """Manifest of a set: its target ``for`` and the digests of its ``entries``; empty for none."""
     try:
         read: dict[str, dict[str, str]] = json.loads((folder / "manifest.json").read_text())
         return read if {"for", "entries"} <= read.keys() else {}

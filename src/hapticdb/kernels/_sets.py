@@ -1,8 +1,8 @@
-"""Sets of machine code that fit here: they come with the package, or are built on this machine.
+"""Lookup of sets of machine code: shipped with the package, or built on this machine.
 
-A wheel has them for processors of `_machine_code.LEVELS`. Where they do not fit, all entries of a
-group are compiled once into the user's cache, and a line says why. A set is as trusted as the
-sources beside it, or as the cache's folder.
+A wheel has sets for the processors of `_machine_code.LEVELS`. On other targets all entries of a
+group are compiled once into the user's cache, with one line on stderr giving the reason. A set is
+as trusted as the package's sources, or as the cache folder.
 """
 
 import sys
@@ -13,7 +13,7 @@ from hapticdb.kernels._cache import cache_folder
 from hapticdb.kernels._machine_code import build, built_for, digest_of, group_of, manifest_of
 
 SHIPPED = Path(__file__).with_name("_machine")
-"""Folder of the sets that come with the package, each under its group's name."""
+"""Folder of the shipped sets, each under its group's name."""
 
 
 def code_of(entry: str) -> bytes | None:
@@ -31,9 +31,9 @@ def code_of(entry: str) -> bytes | None:
 
 @cache
 def fitting_set(group: str) -> tuple[Path, dict[str, str]] | None:
-    """Folder of the set of a group that fits here, and digests of its files, or else it is built.
+    """Folder of a group's set for this target, and digests of its files; built if there is none.
 
-    None if that fails: then each entry is compiled when it is first called.
+    None if the build fails: then each entry is compiled at its first call.
     """
     return _read(SHIPPED / group) or _read(own_set(group)) or _built(group)
 
@@ -45,7 +45,7 @@ def _read(folder: Path) -> tuple[Path, dict[str, str]] | None:
 
 
 def _built(group: str) -> tuple[Path, dict[str, str]] | None:
-    """The set of this machine, built now, with a line that says so."""
+    """The set of this machine, built now and announced on stderr."""
     from hapticdb.kernels import _building  # noqa: PLC0415 - where it is not needed, nobody waits
 
     sys.stderr.write(
@@ -62,12 +62,12 @@ def _built(group: str) -> tuple[Path, dict[str, str]] | None:
 
 
 def own_set(group: str) -> Path:
-    """Folder of the set of a group that this machine builds."""
+    """Folder of a group's set built on this machine."""
     return cache_folder() / f"kernels-{build()}-{group}"
 
 
 def _reason(found: dict[str, str] | None, wanted: dict[str, str]) -> str:
-    """Why the set that came with the package does not do."""
+    """Reason for rejecting a shipped set."""
     if found is None:
         return "none came with this copy"
     for key, here in wanted.items():

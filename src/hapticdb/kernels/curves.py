@@ -3,8 +3,8 @@
 On every curve i is the most significant axis and k the least, and a key fills `3 * bits` bits of a
 non-negative int64. Z-order (Morton 1966) interleaves the bits, ``... i1 j1 k1 i0 j0 k0``; the
 Hilbert curve is Skilling's ("Programming the Hilbert curve", AIP Conf. Proc. 707, 2004). Both are
-hierarchical: ``key >> 3`` is the key of the cube of twice the edge that holds the voxel, on the
-same curve of one bit less.
+hierarchical: ``key >> 3`` is the key of the enclosing cube of twice the edge, on the same curve
+with one bit less.
 """
 
 import numpy as np

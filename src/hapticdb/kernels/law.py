@@ -1,17 +1,17 @@
-"""The force law: what a point of the shell feels, and how a frame adds it up. It is only here.
+"""Force law: response of a point of the shell, and the sum over a frame. Defined here alone.
 
 A *hit* is a point inside an occupied voxel. Hits come from the occupancy alone and are the same
-under every law. What a point *feels* is the law's answer: a depth, and a weight in the frame's
-average. A law may feel a point that is no hit (a distance field does, before the surface), and it
-need not feel every hit (the tangent plane does not, above the plane).
+under every law. A law's response at a point is a penetration depth and a weight in the frame's
+average; a point with a depth above 0 is a *contact*. A contact need not be a hit (a distance field
+responds before the surface), nor a hit a contact (above the tangent plane it is not).
 
 A law consists of a NamedTuple of its numbers, one of them the field `stiffness`, and of the
-functions in `Leaves` that `define` enters for its type. Kernels are compiled once for each type of
-law. One compiled kernel with a branch on a number in the law would be worse: every frame would pass
-the payload of every law, at 0.3 us an array, and a law could not be added from outside.
+functions in `Leaves`, registered for its type by `define`. Kernels are compiled once for each type
+of law. One compiled kernel with a branch on a number in the law would be worse: every frame would
+pass the payload of every law, at 0.3 us an array, and user-defined laws would be impossible.
 
-A *payload* is what a law reads beside the occupancy: the distances of a frame's rows, or of the
-cells in memory (`hapticdb.kernels.field`). None stands for no payload and costs a frame nothing.
+A *payload* is a law's input besides the occupancy: the distances of a frame's rows, or of the
+resident cells (`hapticdb.kernels.field`). None stands for no payload and costs a frame nothing.
 """
 
 import math
@@ -22,28 +22,28 @@ from hapticdb.kernels._jit import FLOAT, chosen_by_type, fields_of, leaf
 from hapticdb.kernels.rigid import moment
 
 AVERAGE_FROM = 10.0
-"""Sum of weights from which force and torque are averaged (McNeely et al. 1999, section 4.3).
+"""Sum of weights from which on force and torque are averaged (McNeely et al. 1999, section 4.3).
 
-A larger number lets a frame of many contacts push harder.
+Larger: stronger wrenches of frames with many contacts.
 """
 NOTHING_NEAR = math.inf
-"""Sample of a point when the payload holds nothing near the point."""
+"""Sample of a point without a surface nearby in the payload."""
 NO_WRENCH = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Force and torque of no point."""
+"""Zero force and torque."""
 
 
 def _no_sample_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001 - as every such leaf
-    """Sample, in rows, of a law that reads no payload."""
+    """Sample, in rows, of a law without payload."""
     return NOTHING_NEAR
 
 
 def _no_sample_of_slot(law, payload, slot, x, y, z):  # noqa: ARG001 - likewise
-    """Sample, in a resident cell, of a law that reads no payload."""
+    """Sample, in a resident cell, of a law without payload."""
     return NOTHING_NEAR
 
 
 def _full_share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
-    """Share, in rows, under a law for which the normal's direction does not matter."""
+    """Share, in rows, under a law independent of the normal's direction."""
     return 1.0
 
 
@@ -53,30 +53,30 @@ def _full_share_of_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noq
 
 
 def _no_reach(law):  # noqa: ARG001 - the arguments of every such leaf
-    """Reach of a law that feels only hits."""
+    """Reach of a law with contacts at hits alone."""
     return 0.0
 
 
 class Leaves(NamedTuple):
-    """Functions of one type of law: plain Python that numba compiles into the kernels.
+    """Functions of one type of law: plain Python, compiled by numba into the kernels.
 
     respond : (law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size) -> depth, weight. The
         point is p, its inward normal n, the centre of its voxel c, world frame, metres; `size` is
-        the voxel size. Depth in metres; the point is felt if it is above 0. The weight is 1 for a
-        point that counts fully in the average, and 0 for a point that does not count.
-    reach : (law) -> largest sample, in voxels, at which a point that is no hit may be felt. A point
-        that is no hit is left out when its sample is above the reach.
-    felt_within : (law) -> distance in voxels. A point that is at least so far from every occupied
-        voxel is no hit, and its sample is above the reach. Resident frames skip such points.
+        the voxel size. Depth in metres, above 0 for a contact. Weight in the average, from 0
+        (ignored) to 1.
+    reach : (law) -> largest sample, in voxels, of a contact without a hit. Points without a hit and
+        with a sample above the reach are skipped.
+    felt_within : (law) -> distance in voxels. A point at least so far from every occupied voxel is
+        no hit, and its sample is above the reach. Resident frames skip such points.
     sample_rows : (law, payload, counts, first, end, x, y, z) -> sample of the point (x, y, z), in
-        voxels from the grid's origin. payload (R, 1000) uint8 are the distances of a frame's rows;
-        rows first .. end - 1 are those of the point's brick, one for each object near it; counts
-        (R,) bool is False for the rows of excluded objects.
+        voxels from the grid's origin. payload (R, 1000) uint8: distances of a frame's rows; rows
+        first .. end - 1: the point's brick, one for each object near it; counts (R,) bool: False
+        for the rows of excluded objects.
     sample_slot : (law, payload, slot, x, y, z) -> sample of the point in a slot of the resident
-        cells; payload (S, 34^3) uint8. It must be the same number as `sample_rows` gives.
-    share_rows : as `sample_rows`, and then nx, ny, nz, sample -> share, 0 to 1, of a point with the
-        inward normal n and that sample. Depth and weight of the point are multiplied by it.
-    share_slot : as `sample_slot`, and then nx, ny, nz, sample -> the same share as `share_rows`.
+        cells; payload (S, 34^3) uint8. It must equal that of `sample_rows`.
+    share_rows : as `sample_rows`, and then nx, ny, nz, sample -> factor, 0 to 1, of depth and
+        weight of a point with the inward normal n and that sample.
+    share_slot : as `sample_slot`, and then nx, ny, nz, sample -> the same factor as `share_rows`.
     """
 
     respond: Callable[..., Any]
@@ -89,16 +89,16 @@ class Leaves(NamedTuple):
 
 
 LEAVES: dict[type, Leaves] = {}
-"""The functions of each type of law."""
+"""Functions of each type of law."""
 
 
 def define(law_type: type, leaves: Leaves) -> None:
-    """Enter the functions of a type of law; call it before any kernel gets a law of that type."""
+    """Register the functions of a type of law, before any kernel call with such a law."""
     LEAVES[law_type] = leaves
 
 
 def reads_distances(law: Any) -> bool:  # noqa: ANN401 - a NamedTuple of a type of its own
-    """Whether frames of that law need the distances of rows as its payload."""
+    """Whether the law's payload in a frame is the rows' distances."""
     return LEAVES[type(law)].sample_rows is not _no_sample_of_rows
 
 
@@ -113,10 +113,10 @@ share_slot = chosen_by_type(lambda law_type: LEAVES[law_type].share_slot)
 
 @leaf
 def accumulate(sums, point, center, depth, stiffness):
-    """Add one felt point to a frame's force and torque: F = K d n, T = (p - m) x F.
+    """Add one contact to a frame's force and torque: F = K d n, T = (p - m) x F.
 
-    sums: force and torque so far; point: p and n, six numbers and perhaps more; center: m, the
-    tool's. Sums run in the order of the shell's points.
+    sums : force and torque so far, N and N m; point : p and n, six numbers or more; center : m, the
+    tool's; depth : d, metres. Callers add in the order of the shell's points.
     """
     fx, fy, fz, tx, ty, tz = sums
     push = stiffness * depth
@@ -127,7 +127,7 @@ def accumulate(sums, point, center, depth, stiffness):
 
 @leaf
 def average_into(out, weight, sums):
-    """Wrench into out (6+,), divided by a tenth of the weight from `AVERAGE_FROM` on."""
+    """Write the wrench to out (6+,), divided by a tenth of the weight from `AVERAGE_FROM` on."""
     tenth = weight / 10.0 if weight >= AVERAGE_FROM else 1.0
     for axis in range(6):
         out[axis] = sums[axis] / tenth

@@ -1,6 +1,6 @@
-"""How hands move: timed poses, smooth random motion, and a mass that a hand pulls along.
+"""Motion of simulated hands: timed poses, smooth random motion, and a mass on a damped spring.
 
-Velocities (6,) are m/s of the origin, then rad/s, both in the frame that the poses are given in.
+Velocities (6,) are m/s of the origin, then rad/s, both in the frame of the poses.
 """
 
 import math
@@ -91,7 +91,7 @@ def _angular_velocity(x, y, z, dx, dy, dz):
 
 @leaf
 def _swaying(time, waves):
-    """Place, turn, velocity and angular velocity at a time."""
+    """Position, rotation vector, velocity and angular velocity at a time."""
     px, vx = _wave(time, waves, np.int64(0))
     py, vy = _wave(time, waves, np.int64(1))
     pz, vz = _wave(time, waves, np.int64(2))
@@ -103,10 +103,11 @@ def _swaying(time, waves):
 
 @entry(FLOAT, FLOATS3, FLOATS2, FLOATS2, FLOATS)
 def sway(time, waves, center, pose, velocity):
-    """Pose and velocity at a time of a hand that sways about a pose by sums of sines.
+    """Pose and velocity at a time of a hand swaying about a pose by sums of sines.
 
-    waves (6, K, 4): amplitude (m; rad for the last three axes, which are a turn), rad/s, phase, the
-    phase's sine. center (4, 4): the pose. Writes pose (4, 4) and velocity (6,), exact derivatives.
+    waves (6, K, 4): amplitude (m; rad for the last three axes, a rotation vector), rad/s, phase,
+    the phase's sine. center (4, 4): the pose. Writes pose (4, 4) and velocity (6,), the exact
+    derivatives.
     """
     (px, py, pz), (x, y, z), moving, turning = _swaying(time, waves)
     velocity[0], velocity[1], velocity[2] = moving
@@ -137,12 +138,13 @@ def survey(waves, cycle, n_samples):
 def pull(
     n_steps, step, ahead, rest, hand, hand_velocity, wrench, inertias, grips, body, pose, velocity
 ):
-    """Let a hand pull a body along by a critically damped spring, against a wrench.
+    """Simulate a body pulled by a hand through a critically damped spring, against a wrench.
 
-    n_steps semi-implicit steps of step seconds. ahead: seconds from the first step's start to the
-    time of hand (4, 4) and hand_velocity (6,); before that the hand moved at that velocity.
-    inertias (kg, kg m^2) and grips (N/m, N m/rad) are pairs. body (13,): position, unit quaternion,
-    velocity; changed in place. Writes pose (4, 4) and velocity (6,) for `rest` seconds later.
+    n_steps semi-implicit Euler steps of step seconds. ahead: seconds from the first step's start to
+    the time of hand (4, 4) and hand_velocity (6,), a velocity constant until then. inertias
+    (kg, kg m^2) and grips (N/m, N m/rad) are pairs. body (13,): position, unit quaternion,
+    velocity; changed in place. Writes pose (4, 4), extrapolated by `rest` seconds, and
+    velocity (6,).
     """
     mass, inertia = inertias
     grip, turn_grip = grips

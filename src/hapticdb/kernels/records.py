@@ -1,14 +1,12 @@
-"""Records: the named state that crosses between Python, kernels and processes.
+"""Records: structured dtypes for state shared by Python, kernels and processes.
 
-Each layout is a structured NumPy dtype. A kernel takes an array of records, without axes or with
-one axis, and reads ``record = array[()]`` once. After that a field is an offset that the compiler
-knows, so reading a field costs the same as reading a number of a vector. Passing one record with
-many fields to a kernel costs 0.4 us, and every further array costs 0.2 us (a NamedTuple costs that
-for each array in it), so numbers that belong together form one record.
+A kernel takes an array of records of 0 axes or 1 and reads ``record = array[()]`` once. A field is
+then a constant offset, as cheap as an element of a vector. Passing one record to a kernel costs 0.4
+us, and every further array 0.2 us (a NamedTuple costs that for each of its arrays), so related
+numbers form one record.
 
-In Python, ``array["hits"]`` is a view of a field; a loop that runs a thousand times a second makes
-its views once, with `views_of`. This module imports numpy alone, so that whoever needs a layout
-does not load numba.
+In Python, ``array["hits"]`` is a view of a field; a loop at 1 kHz makes its views once, with
+`views_of`. This module imports numpy alone, so a layout is available without numba.
 """
 
 from collections import namedtuple
@@ -21,25 +19,25 @@ from numpy.typing import NDArray
 Layout = np.dtype[np.void]
 
 MOST_MISSED = 63
-"""Most unknown cells that a frame lists for the fetching process. Larger: fewer rounds of fetching
-when the tool is far in unknown cells, and more comparisons for each unknown cell of a frame."""
+"""Most unknown cells in a frame's list for the fetching process. Larger: fewer rounds of fetching
+for a tool deep in unknown cells, and more comparisons for each unknown cell of a frame."""
 MOST_ASKED = 64
-"""Most voxels that a session asks the objects of at a time, and most objects in the answer. Larger:
-small objects are named sooner, and the statement is longer."""
+"""Most voxels in a session's request for object ids, and most ids in the reply. Larger: ids of
+small objects arrive sooner, and the statement is longer."""
 LINE = 64
-"""Bytes of a processor's cache line: processes that write to one line slow one another down."""
+"""Bytes of a cache line: writers of the same line slow each other down (false sharing)."""
 SESSION_BYTES = 2560
-"""Size of a session's row on the desk: whole cache lines, such that the table's arrays keep their
-pages."""
+"""Size of a session's row in the request queue: whole cache lines, with spare bytes for new fields
+at an unchanged size of the table."""
 
 
 def _record(fields: Sequence[tuple[object, ...]]) -> Layout:
-    """Aligned layout of those fields; a record has them as attributes, in plain Python, too."""
+    """Aligned layout of those fields; records have them as attributes in plain Python, too."""
     return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 
 def _record_in_lines(groups: Sequence[Sequence[tuple[object, ...]]], size: int) -> Layout:
-    """Layout of groups of fields, each beginning on a cache line of its own."""
+    """Layout of groups of fields, each group from a new cache line on."""
     names, formats, offsets = [], [], []
     start = 0
     for group in groups:
@@ -55,9 +53,9 @@ def _record_in_lines(groups: Sequence[Sequence[tuple[object, ...]]], size: int) 
 
 
 def views_of(record: NDArray[np.void]) -> Any:  # noqa: ANN401 - its fields are the layout's
-    """Views of the fields of a record () by their names; a nested record gives nested views.
+    """Views of the fields of a record () by name, nested for nested records.
 
-    A number is a view () of its own: ``views.hits.item()`` reads it, ``views.hits[()] = 1`` writes.
+    A number is a view (): ``views.hits.item()`` reads it, ``views.hits[()] = 1`` writes it.
     """
     names = record.dtype.names or ()
     views = [record[name] for name in names]
@@ -66,7 +64,7 @@ def views_of(record: NDArray[np.void]) -> Any:  # noqa: ANN401 - its fields are 
 
 
 def pose_numbers(record: NDArray[np.void]) -> NDArray[np.float64]:
-    """Position and unit quaternion of a record () as numbers (7,), the same memory."""
+    """View (7,) of position and unit quaternion of a record ()."""
     fields = record.dtype.fields
     assert fields is not None  # noqa: S101 - it is a record
     start = fields["position"][1]
@@ -84,27 +82,27 @@ GRID: Layout = _record(
         ("shift", "<i8"),  # from a voxel's key to its row's: 0, or 9 for bricks
     ]
 )
-"""The grid of an environment and its rows, for a frame on rows."""
+"""Grid of an environment, for a frame on rows."""
 
 DECODED_BYTES = 64 << 20
-"""Most memory that the decoded bricks of an environment's frames take. SQLite's page cache is
-smaller by as much; PostgreSQL has none in the client. Larger: more of a scene is read once."""
+"""Most bytes of the decoded bricks of an environment's frames. SQLite's page cache is smaller by as
+much; PostgreSQL has none in the client. Larger: more of a scene is read only once."""
 ENTRIES_A_ROW = 4
-"""Most entries of the directory for each row: half of them stay free, and many bricks are empty."""
+"""Most directory entries for each row: half of them stay free, and many bricks are empty."""
 BRICK: Layout = _record(
     [
         ("key", "<i8"),
         ("first", "<i4"),  # slot of its first row
         ("end", "<i4"),  # slot behind its last row; 0 where the entry is free
-        ("least", "<i4"),  # slot of the least of its rows that count, -1 if none does
-        ("filter", "<i4"),  # number of the filter under which that was found
+        ("least", "<i4"),  # slot of the least distances of rows not excluded, -1 without any
+        ("filter", "<i4"),  # number of the filter for `least`
     ]
 )
-"""A brick in memory, by its key (`kernels.query.bricks`): an entry of the directory."""
+"""Directory entry of a cached brick (`kernels.query.bricks`), in a hash table by key."""
 
 
 def _decoded(n_values: int) -> Layout:
-    """Slots of decoded rows with so many distances, as many as fit into `DECODED_BYTES`."""
+    """Layout of decoded rows with so many distances each; `DECODED_BYTES` limit the slots."""
     row = [("id", "<i8", ()), ("found", "<i8", ()), ("occupancy", "u1", (64,))]
     row += [("counts", "u1", ()), ("touched", "u1", ()), ("distances", "u1", (n_values,))]
     slots = DECODED_BYTES // (np.dtype(row).itemsize + ENTRIES_A_ROW * BRICK.itemsize)
@@ -112,134 +110,135 @@ def _decoded(n_values: int) -> Layout:
 
 
 OCCUPIED, MEASURED = _decoded(1), _decoded(1000)
-"""Rows in memory without and with distances; slot 0 stays unused.
+"""Cached rows without and with distances; slot 0 stays unused.
 
-id, occupancy, distances : of a row, or the least distances of some rows; counts : whether its
-object is felt, True for a least; found, touched : memory of a frame, which leaves touched False.
+id, occupancy, distances : of a row, or the least distances of several rows; counts : False for rows
+of excluded objects, True for least distances; `found`, touched : scratch of a frame, touched False
+between frames.
 """
 
 RESULTS = 10
-"""Numbers of a frame's result; `kernels.resident.cells` names them."""
+"""Length of a frame's result; its indices are in `kernels.resident.cells`."""
 
 HAND: Layout = _record(
     [
         ("position", "<f8", 3),  # m
         ("quaternion", "<f8", 4),  # unit, scalar first
         ("velocity", "<f8", 6),  # of the origin, m/s, then rad/s
-        ("is_stale", "?"),  # hold, as if all cells were unknown
+        ("is_stale", "?"),  # all cells count as unknown
         ("is_open", "?"),  # the clutch
     ]
 )
-"""The handle to which the tool is pulled: its frame in the scene. NaN: there is no handle yet."""
+"""Handle, the target of the tool: its frame in the scene. NaN: no handle yet."""
 
 HANDLE: Layout = _record(
     [
         ("scale", "<f8"),  # m of the scene for a metre of the device
-        ("clutch", "<i8"),  # bit of the button that opens it, 0 for none
-        ("starts_elsewhere", "?"),  # than at the hand: at `start`
+        ("clutch", "<i8"),  # bit of its button, 0 for none
+        ("starts_elsewhere", "?"),  # at `start`, not at the hand
         ("start", "<f8", 7),  # position m, unit quaternion
         ("is_placed", "?"),  # there was a reading
-        ("x", "<f8"),  # of its last known place, m
+        ("x", "<f8"),  # of its last finite position, m
         # from hand to handle: added to the hand's position, applied before the hand's turn
         ("position", "<f8", 3),
         ("quaternion", "<f8", 4),
     ]
 )
-"""How a device's readings move a handle (`kernels.hand.handle`)."""
+"""Transform from a device's readings to a handle (`kernels.hand.handle`)."""
 
 READING: Layout = _record([("pose", "<f8", (4, 4)), ("velocity", "<f8", 6), ("buttons", "<i8")])
-"""What a device has read (`hapticdb.devices.protocol.Reading`)."""
+"""Reading of a device (`hapticdb.devices.protocol.Reading`)."""
 
 TOOL: Layout = _record(
     [
         ("position", "<f8", 3),  # of the tool's frame, m
         ("quaternion", "<f8", 4),  # unit, scalar first
-        ("kept", "<f8", 6),  # the last unfaded wrench for the hand: N, N m
-        ("held_for", "<f8"),  # s for which that wrench is kept
-        ("risen", "<f8"),  # share of the wrench that is sent, 0 to 1
-        ("version", "<i8"),  # of the cells that `felt` was computed from, 0 for none
+        ("kept", "<f8", 6),  # last unfaded wrench for the hand: N, N m
+        ("held_for", "<f8"),  # s since that wrench
+        ("risen", "<f8"),  # share of the wrench sent, 0 to 1
+        ("version", "<i8"),  # of the cells for `felt`, 0 for none
         ("felt", "<f8", RESULTS),  # frame at this pose, about the centre of mass
         ("pose", "<f8", (4, 4)),
-        ("tried_pose", "<f8", (4, 4)),  # that is looked at
+        ("tried_pose", "<f8", (4, 4)),  # of the present query
     ]
 )
-"""The tool; at the start all fields but position and quaternion are zero."""
+"""Simulated tool. Initially all fields but position and quaternion are zero."""
 
 SENT: Layout = _record(
     [
         ("wrench", "<f8", 6),  # for the device, about the handle's origin: N, N m
         ("hits", "<i8"),
         ("contacts", "<i8"),
-        ("unknown", "<i8"),  # points, at the pose that was tried
+        ("unknown", "<i8"),  # points, at the tried pose
         ("deepest", "<f8"),  # m
-        ("n_steps", "<i8"),  # made
-        ("marks", "<i8"),  # bits named in `kernels.hand.holding`; `flags` is NumPy's own name
+        ("n_steps", "<i8"),
+        ("marks", "<i8"),  # bits of `kernels.hand.holding`; `flags` is a name of NumPy's
         ("revision", "<i8"),  # of the database
     ]
 )
-"""The result of a period of the loop."""
+"""Result of a period of the loop."""
 
 SERVO: Layout = _record([("tool", TOOL), ("hand", HAND), ("sent", SENT)])
-"""All that a loop keeps from one period to the next."""
+"""State of a loop between periods."""
 
 MOST_TRAIL = 64
-"""Places of the hand that the quasi-static coupling remembers for its damping. Larger: the same
-time is remembered at higher loop rates."""
+"""Positions of the hand in the quasi-static coupling's history, for its damping. Larger: the same
+time span at higher loop rates."""
 FOLLOWER: Layout = _record(
     [
-        ("looked_at", "<f8", 7),  # pose of the tool that the near points belong to
-        ("travelled", "<f8"),  # voxels that the farthest point may have moved so far
-        ("astray", "<f8"),  # voxels from the tool's pose to the one looked at last
-        ("clearance", "<f8"),  # voxels: no point is nearer to a surface, at the tool's pose
-        ("tried_clearance", "<f8"),  # the same at the pose looked at last
+        ("looked_at", "<f8", 7),  # pose of the tool for the near points
+        ("travelled", "<f8"),  # path length of the farthest point, upper bound, voxels
+        ("astray", "<f8"),  # voxels from the tool's pose to that of the last query
+        ("clearance", "<f8"),  # least distance of points, lower bound, at the tool's pose, voxels
+        ("tried_clearance", "<f8"),  # the same at the pose of the last query
         # the equations of a step (`kernels.hand.step`)
-        ("side", "<i8"),  # 0 or 1: which half of the rows has the near points at the tool's pose
+        ("side", "<i8"),  # 0 or 1: half of the rows for the near points at the tool's pose
         ("n_near", "<i8"),  # near points at the tool's pose
         ("n_active", "<i8"),  # points in the contact set of the last step
         ("n_bends", "<i8"),  # rows of curvature in its equations
-        ("is_bent", "?"),  # the surface is hollow: its curvature is computed
+        ("is_bent", "?"),  # curvature of hollow surfaces is computed
         ("matrix", "<f8", (6, 6)),  # of the step's equations: N/m, N, N m
         ("right", "<f8", 6),  # their right-hand side: N, N m
         ("step", "<f8", 6),  # of the tool's centre: m, rad
         ("pull", "<f8", 6),  # from tool to hand: m, rad
         ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad of the scene
-        ("n_tried", "<i8"),  # near points at the pose looked at last, in the other half
+        ("n_tried", "<i8"),  # near points at the pose of the last query, in the other half
         ("n_unknown", "<i8"),  # points in unknown cells there
-        ("n_looks", "<i8"),  # poses looked at in this period
-        ("is_walking", "?"),  # whether the pose that is looked at may be forbidden
-        ("is_loose", "?"),  # the tool lies in something and feels nothing yet
-        ("is_braked", "?"),  # the last step was cut short: the next one is held back
-        ("last_hand", "<f8", 3),  # the handle's place in the last period, m
-        ("trail", "<f8", (MOST_TRAIL, 4)),  # time s and place m of the handle, in turns
-        ("n_trail", "<i8"),  # places written since the handle was last lost
+        ("n_looks", "<i8"),  # queries in this period
+        ("is_walking", "?"),  # the pose of the query may be forbidden
+        ("is_loose", "?"),  # the tool is inside an object, without contacts yet
+        ("is_braked", "?"),  # the last step was shortened: the next one is braked
+        ("last_hand", "<f8", 3),  # the handle's position in the last period, m
+        ("trail", "<f8", (MOST_TRAIL, 4)),  # ring buffer: time s and position m of the handle
+        ("n_trail", "<i8"),  # positions written since the handle was last lost
         ("clock", "<f8"),  # s
-        ("share", "<f8"),  # of the stiffness that is used, 0 to 1
-        ("wanted_share", "<f8"),  # the share that the guard moves it to
-        ("reversals", "<f8"),  # of the force, forgotten as time passes
+        ("share", "<f8"),  # of the stiffness in use, 0 to 1
+        ("wanted_share", "<f8"),  # target of `share`, by the guard
+        ("reversals", "<f8"),  # of the force, with exponential decay
         ("extreme", "<f8"),  # N, greatest or least force since the last reversal
         ("is_rising", "?"),  # the force, since then
         # of large tools
         ("is_large", "?"),  # set by the caller: a run's sphere is tested before its points
-        ("merges_from", "<i8"),  # set by the caller: near points that are merged; 0: none
-        ("merged", "<i8"),  # points for which one contact stands; 0 counts as 1
-        # where a GPU looks
-        ("looker", "<i8"),  # address of what is called for a look; 0: the period's kernel looks
-        ("way", "<f8"),  # voxels that the farthest point has moved since the last look
-        ("anew", "<i8"),  # what the next look forgets first, named in `near_points`
+        ("merges_from", "<i8"),  # set by the caller: number of near points to merge at; 0: never
+        ("merged", "<i8"),  # points for each contact; 0 counts as 1
+        # of queries on a GPU
+        ("looker", "<i8"),  # address of the callback of a query; 0: on the CPU
+        ("way", "<f8"),  # motion of the farthest point since the last query, voxels
+        ("anew", "<i8"),  # reset before the next query: a code of `near_points`
     ]
 )
-"""What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""
+"""State of the quasi-static coupling, in addition to the tool. Initially all zero."""
 
 POINT: Layout = _record(
     [
-        ("due", "<f8"),  # way of the farthest point, voxels, at which the point is looked at next
+        ("due", "<f8"),  # path length (`travelled`), voxels, of the point's next query
         ("run_due", "<f8"),  # of point n: the least `due` of run number n
-        ("u", "<f8"),  # distance at the tool's pose, voxels; h where the point is not near
+        ("u", "<f8"),  # distance at the tool's pose, voxels; h for a point not near
         ("bound", "<f8"),  # lower bound of it, likewise
         ("onset", "<f8"),  # distance at which its contact begins, voxels
     ]
 )
-"""What the coupling keeps of each point of the tool (`kernels.hand.near_points`)."""
+"""State of the coupling for each point of the tool (`kernels.hand.near_points`)."""
 
 NEAR: Layout = _record(
     [
@@ -252,8 +251,8 @@ NEAR: Layout = _record(
         ("about", "<f8", 3),  # its moment about the tool's centre, m
     ]
 )
-"""A point near a surface. A step reads all near points in turn: 80 bytes each, and no others. With
-the bends in the same record, broad contacts take a tenth longer."""
+"""Point near a surface. A step scans all near points, 80 bytes each. With the bends in the same
+record, broad contacts take a tenth longer."""
 BENDS: Layout = _record(
     [
         ("curvature", "<f8", 2),  # 1/voxel, 0 for none
@@ -261,14 +260,14 @@ BENDS: Layout = _record(
         ("about", "<f8", (2, 3)),  # their moments about the tool's centre, m
     ]
 )
-"""The two ways in which a hollow surface bends towards a near point."""
+"""Principal curvatures of a hollow surface towards a near point, at most two."""
 
 LOOK: Layout = _record(
     [
         ("number", "<i8"),
-        ("epoch", "<i8"),  # numbers of points that are older are forgotten
+        ("epoch", "<i8"),  # older values of points are invalid
         ("run", "<i8"),  # points of a run
-        # as FOLLOWER has them, for the pose that is tried
+        # as in FOLLOWER, for the tried pose
         ("is_large", "?"),
         ("is_anew", "?"),
         ("is_bent", "?"),
@@ -277,11 +276,11 @@ LOOK: Layout = _record(
         ("way", "<f8"),
         ("pose", "<f8", (3, 4)),
         # for `put_back` alone
-        ("last", "<i8"),  # point up to which stays what the look wrote
+        ("last", "<i8"),  # points beyond it are restored
         ("n_due", "<i8"),  # runs of its second launch
     ]
 )
-"""What is asked of a look on the GPU (`kernels.gpu.looks`)."""
+"""Parameters of a query on the GPU (`kernels.gpu.looks`)."""
 
 FRAME: Layout = np.dtype(
     [
@@ -296,27 +295,27 @@ FRAME: Layout = np.dtype(
         ("spring", "<f8", (9,)),  # between hand and tool: `kernels.hand.device_spring`
         ("hits", "<i4"),
         ("contacts", "<i4"),
-        ("unknown", "<i4"),  # points in cells that were not resident
+        ("unknown", "<i4"),  # points in cells not resident
         ("deepest", "<f4"),  # m
         ("revision", "<i8"),  # of the database
         ("buttons", "<i4"),  # bit mask
         ("state", "<i4"),  # bits of `hapticdb.recording.frame.State`
     ]
 )
-"""One frame of the loop, and a row of a recording: 336 bytes. Inputs of the frame: dt, hand,
-hand_velocity, spring, and of the state that the hand is stale, the clutch, and new cells. Outputs:
-tool, applied, hits, contacts, deepest and the rest of the state."""
+"""One frame of the loop, and a row of a recording: 336 bytes. Inputs: dt, hand, hand_velocity,
+spring, and of the state the bits for a stale hand, an open clutch and new cells. Outputs: tool,
+applied, hits, contacts, deepest and the other bits of the state."""
 
 TOLD: Layout = _record(
     [
         ("is_active", "?"),  # a loop runs here
         ("tool", "<f8", 3),  # the shell's centre, m
-        ("handle", "<f8", 3),  # where the hand wants that centre, m
+        ("handle", "<f8", 3),  # target of that centre by the hand, m
         ("velocity", "<f8", 3),  # of the handle, m/s
         ("radius", "<f8"),  # of the point farthest from the centre, m
     ]
 )
-"""What a loop tells the fetching process about its tool."""
+"""Prefetch request of a loop: position and motion of its tool."""
 
 SESSION: Layout = _record_in_lines(
     [
@@ -326,18 +325,18 @@ SESSION: Layout = _record_in_lines(
             ("n_missed", "<i8"),
             ("missed", "<i8", MOST_MISSED),  # keys of the unknown cells of the last frame
             ("n_asked", "<i8"),
-            ("asked", "<i8", MOST_ASKED),  # keys of voxels whose objects the loop asks for
+            ("asked", "<i8", MOST_ASKED),  # keys of voxels, for the ids of their objects
         ],
         [  # written by the fetching process
-            ("heard", "<i8"),  # the sequence number that it has read
-            ("n_missing", "<i8"),  # cells wanted at that number and not there yet
+            ("heard", "<i8"),  # last sequence number read
+            ("n_missing", "<i8"),  # unknown cells of that request
             ("n_objects", "<i8"),
-            ("objects", "<i8", MOST_ASKED),  # ids of the objects in the voxels asked for
+            ("objects", "<i8", MOST_ASKED),  # ids of the objects in the requested voxels
         ],
     ],
     SESSION_BYTES,
 )
-"""A session's row on the desk (`hapticdb.resident.table.Desk`)."""
+"""Row of a session in the request queue (`hapticdb.resident.table.RequestQueue`), a seqlock."""
 
 FIGURES: Layout = _record(
     [
@@ -349,39 +348,38 @@ FIGURES: Layout = _record(
         ("latency", "<f8"),  # s, median of the last 32 batches
         ("worst", "<f8"),  # s, of all batches
         ("resident", "<i8"),  # cells in memory now
-        ("empty", "<i8"),  # cells known to be empty now
-        ("wanted", "<i8"),  # cells wanted, summed over all looks
-        ("granted", "<i8"),  # wanted cells that were in memory
-        ("losses", "<i8"),  # how often the database was lost
-        ("lag", "<f8"),  # s since the commit that a standby replayed last; NaN: none answers
+        ("empty", "<i8"),  # cells without voxels, now
+        ("wanted", "<i8"),  # cells requested, summed over all checks
+        ("granted", "<i8"),  # requested cells already in memory
+        ("losses", "<i8"),  # of the database
+        ("lag", "<f8"),  # s since the commit replayed last by a standby; NaN: none answers
     ]
 )
-"""Counts and latencies of the fetching process: a `CacheFigures` has them by these names."""
+"""Counts and latencies of the fetching process, with the names of `CacheFigures`."""
 
 MOST_SHOWN = 64
-"""Most contacts of a hosted session that others see. Larger: broad contacts are drawn more
-densely."""
+"""Most published contacts of a hosted session. Larger: broad contacts are drawn more densely."""
 TIME_BINS, TIME_BIN = 20_000, 1e-6
-"""Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 20 ms. Larger
-bins: less exact percentiles. The worst time is kept exactly."""
+"""Number and width (s) of the bins of a slot's histograms of times, from 0 to 20 ms. Larger bins:
+less exact percentiles. The worst time is stored exactly."""
 
 SEAT: Layout = _record(
     [
-        # written by who began the session
-        ("state", "<i8"),  # named in `hapticdb.session.board`
+        # written by the owner of the session
+        ("state", "<i8"),  # of `hapticdb.session.shared_table`
         ("id", "<i8"),  # of the session
         ("worker", "<i8"),  # number of the worker process
         ("is_asked_to_end", "<i8"),
-        # written by the process that moves a hosted session's hand
+        # seqlock, written by the client of a hosted session
         ("hand_sequence", "<i8"),  # odd while the next fields are written
         ("hand_time", "<i8"),  # ns, CLOCK_MONOTONIC
         ("hand_pose", "<f8", 7),  # position m, unit quaternion, scalar first
-        ("is_held", "<i8"),  # somebody holds the tool
+        ("is_held", "<i8"),  # the tool is dragged
         ("n_moves", "<i8"),
-        # written by the process that runs the periods; counts of frames and of what they met
+        # written by the process of the servo loop; counts of frames by their results
         ("n_frames", "<i8"),
-        ("missed", "<i8"),  # deadlines at which no frame began
-        ("in_time", "<i8"),  # frames that were done within their period
+        ("missed", "<i8"),  # deadlines without a frame
+        ("in_time", "<i8"),  # frames done within their period
         ("hit_frames", "<i8"),
         ("contact_frames", "<i8"),
         ("unknown_frames", "<i8"),
@@ -399,7 +397,7 @@ SEAT: Layout = _record(
         ("worst_lateness", "<f8"),  # s
         ("worst_elapsed", "<f8"),  # s
         ("n_objects", "<i8"),
-        ("objects", "<i8", MOST_ASKED),  # ids of what is touched
+        ("objects", "<i8", MOST_ASKED),  # ids of touched objects
         ("contacts_sequence", "<i8"),  # odd while the contacts are written
         ("n_contacts", "<i8"),
         ("contacts", "<f8", (MOST_SHOWN, 6)),  # point m and force on the tool N, world frame
@@ -407,26 +405,26 @@ SEAT: Layout = _record(
         ("elapsed", "<i8", TIME_BINS + 1),
     ]
 )
-"""A session on the board (`hapticdb.session.board`), which several processes share."""
+"""Slot of a session in the shared table (`hapticdb.session.shared_table`)."""
 
 WAY: Layout = _record(
     [
-        ("arriving", "<f8", 7),  # pose on the board: position m, unit quaternion
+        ("arriving", "<f8", 7),  # pose read from the slot: position m, unit quaternion
         ("start", "<f8", 7),
         ("end", "<f8", 7),
         ("began", "<i8"),  # ns
-        ("seconds", "<f8"),  # that the way takes
+        ("seconds", "<f8"),  # duration
     ]
 )
-"""The way of a hand to the pose that arrived last."""
+"""Segment of a hosted hand's interpolated motion, to its newest pose."""
 
 STATION: Layout = _record(
     [
         ("is_running", "<i8"),  # all other fields are complete
-        ("seat", "<i8"),  # row of the board
+        ("seat", "<i8"),  # row of the shared table
         ("reader", "<i8"),  # row of the table of cells
-        ("source", "<i8"),  # of the hand: named in `kernels.period.loop`
-        ("is_frame", "<i8"),  # its periods are noted and counted
+        ("source", "<i8"),  # of the hand: a code of `kernels.period.loop`
+        ("is_frame", "<i8"),  # its periods are recorded and counted
         # addresses of the table's arrays and of its row SESSION, and sizes
         *((name, "<i8") for name in ("control", "readers", "keys", "slots", "words", "masks")),
         *((name, "<i8") for name in ("used", "payload", "near", "session")),
@@ -436,19 +434,19 @@ STATION: Layout = _record(
         # addresses of the tool's arrays, and their sizes
         *((name, "<i8") for name in ("points", "center", "spheres", "groups", "columns")),
         *((name, "<i8") for name in ("scratch", "kept", "near_points", "bends", "met")),
-        # of the tool's pose, the law's frame there, and the unknown cells that were met
+        # of the tool's pose, the law's frame there, and the unknown cells
         *((name, "<i8") for name in ("pose", "felt", "missed")),
         *((name, "<i8") for name in ("n_points", "n_spheres", "n_groups", "run")),
         ("place", "<f8", 5),  # origin and voxel size m, voxels on an axis
         ("bits", "<i8"),  # of the grid's curve, on an axis
         ("curve", "<i8"),  # its code
-        ("coupling", "<i8"),  # which of the two rows the next period uses
-        ("used_coupling", "<i8"),  # which one this period uses
+        ("coupling", "<i8"),  # row of `springs` for the next period
+        ("used_coupling", "<i8"),  # row for this period
         ("springs", "<f8", (2, 9)),  # fields of DeviceSpring
         # of a device's hand
         ("handle", HANDLE),
         ("reading", READING),
-        # addresses of what reads the device and what pushes it; 0: the caller does
+        # addresses of the callbacks to read and drive the device; 0: done by the caller
         ("reads", "<i8"),
         ("pushes", "<i8"),
         # of a hosted hand, between arrivals
@@ -457,8 +455,8 @@ STATION: Layout = _record(
         ("gap", "<i8"),  # ns, mean time between arrivals
         ("is_let_go", "<i8"),
         ("way", WAY),
-        ("n_touching", "<i8"),  # points that touch, in `met`
-        # what periods keep
+        ("n_touching", "<i8"),  # touching points, in `met`
+        # state between periods
         ("servo", SERVO),
         ("follower", FOLLOWER),
         # times, ns
@@ -467,11 +465,11 @@ STATION: Layout = _record(
         ("last", "<i8"),  # frame
         ("told_at", "<i8"),
         ("looked_at", "<i8"),
-        ("asked_at", "<i8"),  # 0 where nothing is asked for
+        ("asked_at", "<i8"),  # 0: no request
         ("shown_at", "<i8"),
     ]
 )
-"""A session where its periods run: where its memory is, and what it keeps between them."""
+"""State of a session in its servo loop: addresses of its arrays, and state between periods."""
 
 PACE: Layout = _record(
     [
@@ -484,18 +482,18 @@ PACE: Layout = _record(
         ("begun", "<i8"),  # ns, when it began
         ("dt", "<f8"),  # s since the one before
         ("moment", "<i8", 4),  # scratch of the clock
-        # addresses: of the kernels that move a tool and feel a frame, and of the law's numbers
+        # addresses: of the kernels of tool motion and of a frame, and of the law's numbers
         *((name, "<i8") for name in ("mover", "feeler", "law")),
     ]
 )
-"""What the loop of periods is told, and what it tells."""
+"""Clock and control of the servo loop: its inputs, and its progress."""
 
 NEAR_CUBE: Layout = _record(
     [
         ("key", "<i8"),  # of the cube of space, -1 for none
-        ("bound", "<f8"),  # no occupied voxel is nearer to the cube's middle, voxels
-        ("nearest", "<i8"),  # the voxel, packed, that is so far away; -1: the search ended there
-        ("unused", "<i8"),  # so that no record lies in two cache lines
+        ("bound", "<f8"),  # least distance of occupied voxels from its centre, lower bound, voxels
+        ("nearest", "<i8"),  # voxel at that distance, packed; -1: the search ended there
+        ("unused", "<i8"),  # padding: no record crosses a cache line
     ]
 )
-"""What a thread remembers of a cube of space (`kernels.resident.nearest`)."""
+"""Cached distance of a cube of space, one cache a thread (`kernels.resident.nearest`)."""

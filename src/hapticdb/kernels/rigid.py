@@ -1,7 +1,7 @@
-"""Rigid motion: rotations, poses and quaternions as kernels use them.
+"""Rigid motion in kernels: rotations, poses and quaternions.
 
 A pose is a (4, 4) matrix. A quaternion has the scalar first and unit length. A turn is a rotation
-vector: its axis times its angle in radians.
+vector: axis times angle in radians.
 """
 
 import math
@@ -45,7 +45,7 @@ def first_not_rigid(poses):
 
 @inlined
 def transform_of(pose):
-    """Upper three rows of a pose as twelve numbers, row by row: they stay in registers."""
+    """Upper three rows of a pose as twelve numbers, row by row, for registers instead of memory."""
     return (
         pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3],
         pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3],
@@ -94,7 +94,7 @@ def length_at(numbers, start):
 
 @leaf
 def product(aw, ax, ay, az, bw, bx, by, bz):
-    """Quaternion of turning by b, then by a."""
+    """Quaternion product a b: rotation by b, then by a."""
     return (
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -149,7 +149,7 @@ def quaternion_in(pose):
 
 @leaf
 def write_pose(px, py, pz, w, x, y, z, pose):
-    """Write position and unit quaternion into pose (4, 4), whose last row stays."""
+    """Write position and unit quaternion into pose (4, 4), except its last row."""
     pose[0, 0] = 1.0 - 2.0 * (y * y + z * z)
     pose[0, 1] = 2.0 * (x * y - w * z)
     pose[0, 2] = 2.0 * (x * z + w * y)
@@ -166,9 +166,9 @@ def write_pose(px, py, pz, w, x, y, z, pose):
 
 @leaf
 def pose_of_quaternion(px, py, pz, w, x, y, z, out):
-    """Write the matrix, out (4, 4), of a position and a unit quaternion, which is not normalised.
+    """Write the matrix, out (4, 4), of a position and a unit quaternion, without normalising it.
 
-    A session and its replay both use this function, so that they get the same bits.
+    Shared by a session and its replay, for the same bits.
     """
     write_pose(px, py, pz, w, x, y, z, out)
     out[3, 0] = out[3, 1] = out[3, 2] = 0.0
@@ -177,14 +177,14 @@ def pose_of_quaternion(px, py, pz, w, x, y, z, out):
 
 @leaf
 def numbers_of(body):
-    """Position and unit quaternion of a record that has them, as seven numbers."""
+    """Fields `position` and `quaternion` of a record, as seven numbers."""
     at, turned = body.position, body.quaternion
     return at[0], at[1], at[2], turned[0], turned[1], turned[2], turned[3]
 
 
 @leaf
 def set_numbers(body, numbers):
-    """Write position and unit quaternion, seven numbers, into a record that has them."""
+    """Write seven numbers into the fields `position` and `quaternion` of a record."""
     for n in range(3):
         body.position[n] = numbers[n]
     for n in range(4):

@@ -14,7 +14,7 @@ class _Later(ModuleType):
 
     def __getattr__(self, name: str) -> object:
         value: object = getattr(import_module(self.__name__), name)
-        setattr(self, name, value)  # found here from now on
+        setattr(self, name, value)  # cached for later accesses
         return value
 
 

@@ -74,4 +74,4 @@ def link_leaves_into_entries() -> None:
         begin(self, typing_context, target, library, *others)
 
     Compiler.__init__ = __init__
-    JITCPUCodegen.set_env = lambda *_: None  # constants of functions that are called
+    JITCPUCodegen.set_env = lambda *_: None  # constants of called functions

@@ -93,7 +93,7 @@ BRICK: Layout = _record(
     [
         ("key", "<i8"),
         ("first", "<i4"),  # slot of its first row
-        ("end", "<i4"),  # slot behind its last row; 0 where the entry is free
+        ("end", "<i4"),  # slot behind its last row; 0 if the entry is free
         ("least", "<i4"),  # slot of the least distances of rows not excluded, -1 without any
         ("filter", "<i4"),  # number of the filter for `least`
     ]

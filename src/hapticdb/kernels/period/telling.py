@@ -106,7 +106,7 @@ def note(ring, at, time, dt, lateness, elapsed, station):
     for n in range(spring.shape[0]):
         row.spring[n] = spring[n]
     row.hits, row.contacts, row.deepest = sent.hits, sent.contacts, sent.deepest
-    row.unknown = sent.unknown  # at the pose that was tried
+    row.unknown = sent.unknown  # at the tried pose
     row.revision = sent.revision
     row.buttons = station.reading.buttons
     state = CLUTCH_OPEN if hand.is_open else 0

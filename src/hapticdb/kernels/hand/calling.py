@@ -1,4 +1,4 @@
-"""Calls from a kernel, by an address: of a function of Python, and of another kernel."""
+"""Indirect calls from a kernel: of a Python callback, or of another kernel's machine code."""
 
 import ctypes
 from typing import Any
@@ -8,17 +8,17 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 FUNCTION = ctypes.CFUNCTYPE(ctypes.c_int64)
-"""The kind of function: no arguments, a number back. It takes the interpreter lock itself. Whoever
-has its address keeps it, and it raises nothing, since no kernel can take an error."""
+"""Type of a callback: no arguments, int64 result. ctypes takes the interpreter lock. The owner of
+its address must keep it alive, and it must not raise: a kernel cannot receive the error."""
 
 
 def address_of(function: Any) -> int:  # noqa: ANN401 - a `FUNCTION`
-    """Address of a function."""
+    """Address of a `FUNCTION`, valid during its lifetime."""
     return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
 
 
 def address_of_kernel(kernel: Any, types_of_arguments: tuple[Any, ...]) -> int:  # noqa: ANN401
-    """Address of the machine code of an entry for arguments of those types."""
+    """Address of an entry's machine code for arguments of these numba types, compiled if new."""
     if config.DISABLE_JIT:
         _PLAIN[id(kernel)] = kernel
         return id(kernel)
@@ -32,21 +32,21 @@ _PLAIN: dict[int, Any] = {}
 if config.DISABLE_JIT:
 
     def call(address):
-        """Call the function at an address."""
+        """Call the `FUNCTION` at an address."""
         return FUNCTION(int(address))()
 
     def call_kernel(address, one, two, three):
-        """Call the kernel at an address."""
+        """Call the Python kernel registered under an address."""
         return _PLAIN[int(address)](one, two, three)
 
 else:
 
     @intrinsic
     def call_kernel(typing_context, address, one, two, three):  # noqa: ARG001 - numba's signature
-        """Call the kernel at an address, which returns an integer; what it raises goes on.
+        """Call the kernel at an address for its int64 result; its errors propagate.
 
-        Each argument is a record, which is handed over by its place, or an integer, which may be
-        the address of what the kernel takes a pointer to.
+        Arguments are records, passed by pointer, or integers; an integer may be the address for one
+        of the kernel's pointer parameters.
         """
 
         def generate(context, builder, signature, arguments):
@@ -64,7 +64,7 @@ else:
 
     @intrinsic
     def call(typing_context, address):  # noqa: ARG001 - numba's signature
-        """Call the function at an address."""
+        """Call the `FUNCTION` at an address."""
 
         def generate(context, builder, signature, arguments):  # noqa: ARG001
             kind = cgutils.ir.FunctionType(cgutils.ir.IntType(64), ())

@@ -1,7 +1,7 @@
-"""The spring between hand and tool, in the device's units, and what it pulls in the scene.
+"""Spring between hand and tool: parameters at the device, wrench in the scene.
 
-One metre of the device is S metres of the scene. Forces are the same in both, so that stiffness in
-the scene is K / S, turning stiffness S K_R, and a torque at the device is the scene's over S.
+One metre of the device is S metres of the scene. Forces are equal in both, so in the scene the
+stiffness is K / S and the rotational stiffness S K_R; a torque at the device is the scene's over S.
 """
 
 import math
@@ -19,23 +19,23 @@ from hapticdb.kernels.rigid import (
 )
 
 BEYOND_CAP = 1.2
-"""Most force of the spring, in caps of the device. Larger: the tool is pressed harder than the hand
-feels, and contacts must be stiffer."""
+"""Greatest spring force, in caps of the device. Larger: the tool is pressed harder than the hand,
+and contacts must be stiffer."""
 CONTACT_SHARE = 50.0
-"""Least stiffness of a contact, in stiffnesses of the spring. Larger: contacts give way less."""
+"""Least contact stiffness, in stiffnesses of the spring. Larger: contacts yield less."""
 STOPPING = 4.0
-"""Least stiffness of a contact, in greatest forces of the spring a voxel: one point then stops that
-force within a quarter of a voxel, where distances are exact. Larger: firmer and less smooth."""
+"""Least contact stiffness, in greatest spring forces a voxel: one point then stops this force
+within a quarter of a voxel, in the range of exact distances. Larger: firmer and less smooth."""
 
 
 class DeviceSpring(NamedTuple):
-    """The spring between hand and tool; all but `radius` is measured at the device.
+    """Parameters of the spring between hand and tool; all but `radius` at the device.
 
-    stiffness and turn_stiffness, N/m and N m/rad, above 0; cap and turn_cap: the most force and
-    torque that the spring sends, N and N m; damping, N s/m, of the hand's motion along the force;
-    scale: S, metres of the scene for a metre of the device; radius, m of the scene: distance of the
-    farthest point from the tool's centre; hold and fade, s: how long the wrench is kept when cells
-    are unknown, and how long it then falls to zero.
+    stiffness, turn_stiffness : N/m and N m/rad, above 0. cap, turn_cap : greatest force and torque
+    on the hand, N and N m. damping : N s/m, of the hand's motion along the force. scale : S, metres
+    of the scene for a metre of the device. radius : m of the scene, from the tool's centre to its
+    farthest point. hold, fade : seconds of the unchanged last wrench in unknown cells, and of its
+    fall to zero afterwards.
     """
 
     stiffness: float
@@ -51,17 +51,17 @@ class DeviceSpring(NamedTuple):
 
 @leaf
 def contact_stiffness(spring, size):
-    """Stiffness of a contact, N/m of the scene."""
+    """Stiffness of a contact, N/m of the scene; size : of a voxel, m."""
     most = BEYOND_CAP * spring.cap
     return max(CONTACT_SHARE * spring.stiffness / spring.scale, STOPPING * most / size)
 
 
 @leaf
 def measure_pull(spring, tool, hand, pose, center, follower):
-    """Stretch, m, and turn from tool to hand into follower.pull (6,), stiffnesses into `pulls`.
+    """Stretch, m, and rotation vector from tool to hand into follower.pull (6,); stiffnesses too.
 
-    center (3,): the tool's, in the tool's frame. The spring pulls by BEYOND_CAP of its caps at
-    most.
+    center (3,) : the tool's centre, tool frame; pose (4, 4) : the tool's. The stiffnesses go into
+    `follower.pulls`, lowered to bound force and torque by BEYOND_CAP caps.
     """
     at = moved(transform_of(pose), center[0], center[1], center[2])
     pull, at_hand, lever = follower.pull, hand.position, lever_in_hand(hand, center)
@@ -97,7 +97,7 @@ def at_device(spring, hand, center, fx, fy, fz, tx, ty, tz):
 
 @leaf
 def wrench_of(follower, cap, turn_cap):
-    """Force and torque against follower.pull, about the tool's centre: N and N m, within caps."""
+    """Spring's wrench against follower.pull, about the tool's centre, within caps: N and N m."""
     pull, k, r = follower.pull, follower.pulls[0], follower.pulls[1]
     x, y, z = shortened(-k * pull[0], -k * pull[1], -k * pull[2], cap)
     a, b, c = shortened(-r * pull[3], -r * pull[4], -r * pull[5], turn_cap)
@@ -106,7 +106,7 @@ def wrench_of(follower, cap, turn_cap):
 
 @leaf
 def shortened(x, y, z, longest):
-    """Vector (x, y, z), shortened to the length `longest` where it is longer."""
+    """Vector (x, y, z), limited to the length `longest`."""
     length = math.sqrt(x * x + y * y + z * z)
     scale = longest / length if length > longest else 1.0
     return scale * x, scale * y, scale * z

@@ -1,7 +1,7 @@
-"""Direct rendering: the wrench of a frame at the hand goes to the device, without a coupling.
+"""Direct rendering: contact wrench at the hand's pose, sent to the device without a coupling.
 
-This is the loop of the paper (section 4, Figure 4), under either law. The tool is where the hand
-is, and nothing keeps it out of surfaces. The device's caps bound the wrench.
+This is the loop of the paper (section 4, Figure 4), under any law. The tool is at the hand and may
+penetrate surfaces. The device's caps bound the wrench.
 """
 
 import numpy as np
@@ -16,13 +16,13 @@ from hapticdb.kernels.rigid import numbers_of, set_numbers
 
 @leaf
 def render(terms, center, servo, frame, dt):
-    """Put the tool where the hand is, and send the wrench of the frame there to the device.
+    """Move the tool to the hand, and send the wrench of the frame there to the device.
 
-    terms: a `DeviceSpring`, of which stiffness and damping count for nothing. servo, a record of
-    SERVO: `tool` is updated, `hand` is read, `sent` is written. frame (RESULTS,): at the hand, of a
-    tool with that centre (3,). If the hand is stale or not finite, or points are in unknown cells,
-    the tool stays, and its wrench is kept for `hold` seconds and then falls to zero within `fade`
-    seconds.
+    terms : a `DeviceSpring`, with stiffness and damping unused; center (3,) : the tool's centre,
+    tool frame; servo : record of SERVO, with `hand` as input, `tool` and `sent` as output; frame
+    (RESULTS,) : result at the hand's pose. With a stale or non-finite hand, or points in unknown
+    cells, the tool stays; its last wrench is sent for `hold` seconds and then falls to zero within
+    `fade` seconds.
     """
     tool, hand = servo.tool, servo.hand
     is_lost = hand.is_stale or not is_somewhere(hand)

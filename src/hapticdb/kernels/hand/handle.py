@@ -1,4 +1,4 @@
-"""How a hand moves the handle: by a scale, and an offset that remains after the clutch was open."""
+"""Motion of the handle by the hand: scaled, with an offset adjusted by the clutch."""
 
 import math
 
@@ -7,8 +7,8 @@ from hapticdb.kernels.records import HAND, HANDLE
 from hapticdb.kernels.rigid import product, quaternion_in, set_numbers
 
 FARTHEST = 1e9
-"""Largest credible number in a hand's pose or velocity, in m, m/s or rad/s: places of surveys have
-seven digits. A larger one means that the device is wrong, and the hand is refused."""
+"""Largest credible number in a hand's pose or velocity, m, m/s or rad/s. Survey coordinates have
+seven digits; a larger number is a fault of the device, and the reading is refused."""
 
 
 @leaf
@@ -25,13 +25,13 @@ def _is_credible(pose, velocity):
 
 @entry(FLOATS2, FLOATS)
 def is_somewhere(pose, velocity):
-    """Whether a pose (4, 4) and a velocity (6,) are finite, and no number is beyond FARTHEST."""
+    """Whether a pose (4, 4) and a velocity (6,) are finite and within FARTHEST."""
     return _is_credible(pose, velocity)
 
 
 @leaf
 def _grip(handle, pose, hand):
-    """Set the offset such that the handle stays in place for a hand at pose (4, 4)."""
+    """Compute the offset from a hand at pose (4, 4) to the present handle."""
     position, turn = hand.position, hand.quaternion
     w, x, y, z = quaternion_in(pose)
     # the offset is the right factor: the handle then turns about the same axes as the hand
@@ -44,9 +44,9 @@ def _grip(handle, pose, hand):
 
 @leaf
 def _carry(handle, pose, velocity, hand):
-    """Write the handle's position, turn and velocity for a hand at pose (4, 4), velocity (6,).
+    """Write the handle's position, quaternion and velocity for a hand's pose (4, 4), velocity (6,).
 
-    Without an offset and at scale 1 the handle is exactly at the hand.
+    At scale 1 and without an offset, the handle equals the hand exactly.
     """
     scale, turn = handle.scale, handle.quaternion
     w, x, y, z = quaternion_in(pose)
@@ -62,7 +62,7 @@ def _carry(handle, pose, velocity, hand):
 
 @leaf
 def _place(handle, pose, velocity, hand):
-    """Put the handle where it starts, for the first reading that has a place."""
+    """Initialise the handle at the first credible reading: at `handle.start`, or at the hand."""
     offset = handle.quaternion
     if handle.starts_elsewhere:
         set_numbers(hand, handle.start)
@@ -76,9 +76,10 @@ def _place(handle, pose, velocity, hand):
 
 @leaf
 def follow_reading(handle, pose, velocity, buttons, hand):
-    """Move the handle, a record of HANDLE, as far as a device's reading says; writes `hand`.
+    """Move the handle by one reading of the device; output in `hand`.
 
-    Without a place of the hand the handle has none: its x is NaN.
+    handle : record of HANDLE; pose (4, 4), velocity (6,), buttons : the reading. A reading without
+    credible numbers saves the handle's x in `handle.x` and sets it to NaN.
     """
     position = hand.position
     if not _is_credible(pose, velocity):

@@ -1,4 +1,4 @@
-"""What a period does without a new force: marks, and how the last wrench fades and rises again."""
+"""Periods without a new force: hold, fade and rise of the last wrench, and their marks."""
 
 import math
 
@@ -10,11 +10,10 @@ from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS
 from hapticdb.kernels.rigid import numbers_of, set_numbers
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT = 1, 2, 8, 16
-"""Marks of a period: the last wrench was kept; the kept wrench falls or is zero; part of the period
-was not simulated; a surface held the tool back."""
+"""Marks of a period: last wrench sent again; that wrench falling or zero; part of the period not
+simulated; tool stopped by a surface."""
 RISE_FRAMES = 4
-"""Fewest frames in which a wrench rises to its full size, so that it does not jump after a long
-period. Larger: a slower rise."""
+"""Fewest frames of a wrench's rise to full size: no jump after a long period. Larger: slower."""
 
 
 @inlined
@@ -28,13 +27,13 @@ def is_finite(numbers):
 
 @leaf
 def is_somewhere(hand):
-    """Whether position, turn and velocity of a hand are finite."""
+    """Whether position, quaternion and velocity of a hand are finite."""
     return is_finite(hand.position) and is_finite(hand.quaternion) and is_finite(hand.velocity)
 
 
 @leaf
 def begin_anew(tool):
-    """Set a tool's state to zero, except its position and quaternion."""
+    """Reset a tool's state to zero, except its position and quaternion."""
     for n in range(6):
         tool.kept[n] = 0.0
     for n in range(RESULTS):
@@ -48,7 +47,7 @@ def begin_anew(tool):
 
 @leaf
 def place_lost(tool, hand, is_hand):
-    """Begin anew, at the hand if there is one, with a tool that is not finite."""
+    """Reset a tool with a non-finite state; it moves to the hand if `is_hand`."""
     is_placed = is_finite(tool.position) and is_finite(tool.quaternion)
     if is_placed and is_finite(tool.kept) and math.isfinite(tool.held_for):
         return
@@ -59,7 +58,7 @@ def place_lost(tool, hand, is_hand):
 
 @leaf
 def send(terms, servo, is_held, marks, dt):
-    """Send the tool's kept wrench, as far as it has not faded, its counts, and the marks."""
+    """Write `servo.sent`: the share of the tool's wrench not faded, its counts, and the marks."""
     tool, hand, sent = servo.tool, servo.hand, servo.sent
     share, is_fading = _share_of_wrench(terms, tool, hand, is_held, dt)
     for n in range(6):
@@ -71,9 +70,10 @@ def send(terms, servo, is_held, marks, dt):
 
 @leaf
 def _share_of_wrench(terms, tool, hand, is_held, dt):
-    """Share of the wrench that is sent: it fades while cells are unknown, and rises again.
+    """Share of the wrench to send, and whether it is fading.
 
-    terms: hold and fade, s. While the clutch is open the share falls to zero.
+    terms : with `hold` and `fade`, s. The share falls while `is_held` and rises again afterwards;
+    with an open clutch it falls to zero.
     """
     passed = dt / terms.fade
     faded = 0.0
@@ -92,5 +92,5 @@ def _share_of_wrench(terms, tool, hand, is_held, dt):
 
 @leaf
 def _faded_share(terms, seconds):
-    """Share, 0 to 1, by which a wrench has faded that was kept for so many seconds."""
+    """Share lost, 0 to 1, by a wrench after so many seconds without a new one."""
     return min(max((seconds - terms.hold) / terms.fade, 0.0), 1.0)

@@ -1,8 +1,8 @@
-"""Which points of the tool are near a surface, and how near: one look at one pose.
+"""Proximity query of a tool: its points near a surface at one pose, by the distance field.
 
-A look computes distance and gradient at each point that may be near. A point whose lower bound says
-that it is far is not looked at again until the tool has moved that far: `DUE` is the way of the
-farthest point at which the point is looked at next. The same holds for runs of points.
+A query evaluates distance and gradient at the points possibly near. A point with a large lower
+bound is deferred until the tool has moved as far: its `due` is the path length of the tool's
+farthest point at the point's next evaluation. Runs of points are deferred likewise, by `run_due`.
 """
 
 import math
@@ -37,44 +37,44 @@ from hapticdb.kernels.resident.nearest import room_around
 from hapticdb.kernels.rigid import moment, moved, transform_of
 
 MARGIN = 0.5
-"""Voxels beyond the onset at which a point enters the equations of a step. Larger: longer steps are
-foreseen, and more points are in the equations."""
+"""Distance beyond the onset, voxels, of the points in the equations of a step. Larger: contacts of
+longer steps are predicted, and more points are in the equations."""
 FAR = ONSET + MARGIN + 0.1
-"""Voxels: a point with a greater lower bound is not looked at. The tenth is room for the spline,
-which smooths. Larger: points are looked at more often."""
+"""Greatest lower bound of an evaluated point, voxels; the tenth is room for the smoothing spline.
+Larger: points are evaluated more often."""
 FLOOR = 1.0
-"""Voxels: no step takes a point nearer to a surface. Smaller: firmer contacts, less smooth ones;
-below about 0.7 the gradients are wrong."""
+"""Least distance to a surface, voxels: no step brings a point nearer. Smaller: firmer contacts,
+less smooth ones; below about 0.7 the gradients are wrong."""
 LEAST_BOUND = 0.1
-"""Voxels: least lower bound that a step may take a point to. Smaller: points get nearer to sheets;
-the rule is a proof while it is above 0."""
+"""Least lower bound of the distance, voxels: no step brings a point below it. Smaller: points get
+nearer to sheets; the proof in `path` needs a value above 0."""
 ENOUGH = 0.3
-"""Voxels: a bound of a near point that is not improved any more. Larger: fewer and longer strides
-in contact, and more computing for each point."""
+"""Lower bound of a near point, voxels, sufficient without the tighter `lower_bound`. Larger: fewer
+and longer advances in contact, and more computing for each point."""
 NEVER = 1e30
-"""A way that no tool travels."""
+"""Path length beyond any tool's travel, voxels."""
 
 BENT = 0.05
-"""Curvature, 1/voxel, that is not counted: the noise of stored distances. Larger: less resistance
-along rough surfaces, and steps that overshoot in gentle hollows."""
+"""Curvature, 1/voxel, subtracted as noise of the stored distances. Larger: less resistance along
+rough surfaces, and overshooting steps in gentle hollows."""
 OPEN, SHUT, NOT_KNOWN, MANY = 0, 1, 2, 3
-"""What a look finds: the tool may be there; a point may not; points are in unknown cells; there are
-so many near points that they are merged."""
+"""Results of a query: pose free; a point too near; points in unknown cells; too many near points,
+to be merged."""
 MOST_MERGED = 64
-"""Most points for which one contact stands: a run. Larger: broad contacts cost less."""
+"""Most points represented by one contact: a run. Larger: broad contacts cost less."""
 LONGEST_REST = 16.0
-"""Most voxels that a run of a large tool may go before its sphere is tested again. Larger: fewer
-tests in free space, each of which reads more cells."""
+"""Greatest path length of a large tool's run between tests of its sphere, voxels. Larger: fewer
+tests in free space, and more cells read by each."""
 RUNS_ANEW, POINTS_ANEW = 1, 2
-"""What a look by another forgets first: when runs are due, or when points are, too."""
+"""Resets before a GPU's next query: of `run_due` alone, or of `due`, too."""
 ROOMY = 4
-"""Contacts are split again when fewer than this part of the most are near. Larger: points come back
-later, and the number of contacts changes less often."""
+"""Merged contacts are split again with fewer near points than this part of the most. Larger: points
+return later, and the number of contacts changes less often."""
 
 
 @leaf
 def clamped_into(place, px, py, pz):
-    """A point, m, moved into the grid, and the way back out of it: six numbers, voxels."""
+    """Point, m, clamped into the grid, and its offset from there: six numbers, voxels."""
     size, last = place.size, place.side - 1e-6
     px, py, pz = (px - place.x) / size, (py - place.y) / size, (pz - place.z) / size
     x, y, z = min(max(px, 0.0), last), min(max(py, 0.0), last), min(max(pz, 0.0), last)
@@ -83,9 +83,9 @@ def clamped_into(place, px, py, pz):
 
 @leaf
 def _outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
-    """Distance, gradient and bound at a point outside the grid, from those where it was clamped to.
+    """Distance, gradient and bound at a point outside the grid, from those at the clamped point.
 
-    (dx, dy, dz): the way out, voxels. All surfaces are in the grid, so the way out adds to u.
+    (dx, dy, dz) : offset from there, voxels. All surfaces are in the grid, so its length adds to u.
     """
     way = math.sqrt(dx * dx + dy * dy + dz * dz)
     gx = gx if dx == 0.0 else dx / way
@@ -96,7 +96,7 @@ def _outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
 
 @inlined
 def distance_at(payload, slot, mask, at):
-    """Distance u, gradient (3) and bound at a point `clamped_into` the grid: five numbers."""
+    """Distance u, gradient (3) and lower bound at a point from `clamped_into`: five numbers."""
     x, y, z, dx, dy, dz = at
     i, j, k = np.int64(x), np.int64(y), np.int64(z)
     u, gx, gy, gz = HALF_WIDTH, 0.0, 0.0, 0.0
@@ -114,7 +114,7 @@ def distance_at(payload, slot, mask, at):
 
 @inlined
 def bound_at(payload, slot, mask, at):
-    """The bound of `distance_at` alone."""
+    """Lower bound of `distance_at` alone."""
     x, y, z, dx, dy, dz = at
     if (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
         bound = nearest_bound(payload, slot, x, y, z)
@@ -129,11 +129,11 @@ def bound_at(payload, slot, mask, at):
 
 @leaf
 def _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
-    """Curvatures of a hollow surface across a gradient and their unit directions: c, v, d, w.
+    """Principal curvatures of a hollow surface across a gradient, and directions: c, v, d, w.
 
-    The second derivatives are those of the distance. c is not below d; a curvature is 0 where the
-    surface is flat or bulges. Eigenvalues of the 2 x 2 matrix in the plane across the gradient, in
-    closed form.
+    Eigenvalues, in closed form, of the negated 2 x 2 matrix of the distance's second derivatives in
+    the plane across the gradient, less BENT. c >= d; 0 for a flat or bulging surface; v, w are unit
+    vectors.
     """
     ux, uy, uz = (gz, 0.0, -gx) if abs(gy) > 0.7 * (abs(gx) + abs(gz)) else (-gz, 0.0, gx)
     if abs(ux) + abs(uz) < 1e-9:
@@ -169,16 +169,16 @@ def _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
 
 @leaf
 def along_and_about(lever, x, y, z):
-    """A direction at a lever (3) from the centre, and its moment: six numbers."""
+    """Direction at a lever (3) from the centre, and its moment: six numbers."""
     a, b, c = moment(lever[0], lever[1], lever[2], x, y, z)
     return x, y, z, a, b, c
 
 
 @leaf
 def bends_at(payload, slot, at, lever, looked):
-    """Two curvatures at a near point, and `along_and_about` of both ways in which it bends.
+    """Two curvatures at a near point, and `along_and_about` of both directions.
 
-    at: `clamped_into` the grid; lever (3), m; looked: of `distance_at` there.
+    at : from `clamped_into`; lever (3), m; looked : from `distance_at` there.
     """
     xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, at[0], at[1], at[2])
     c, vx, vy, vz, d, wx, wy, wz = _bends_of(
@@ -189,14 +189,14 @@ def bends_at(payload, slot, at, lever, looked):
 
 @inlined
 def may_be_hollow(mask, at, u):
-    """Whether bends are looked for at a near point of distance u."""
+    """Whether to compute curvatures at a near point: u below ONSET, in a brick with distances."""
     bit = brick_bit(np.int64(at[0]), np.int64(at[1]), np.int64(at[2]))
     return u < ONSET and (mask >> bit) & np.uint64(1) != 0
 
 
 @leaf
 def _write_bends(bends, found):
-    """Write the bends of a near point from `bends_at` -> whether there are any."""
+    """Write the curvatures of a near point from `bends_at`; return whether any is above 0."""
     bends.curvature[0], bends.curvature[1] = found[0], found[1]
     for axis in range(3):
         bends.along[0, axis], bends.about[0, axis] = found[2][axis], found[2][3 + axis]
@@ -206,18 +206,18 @@ def _write_bends(bends, found):
 
 @inlined
 def _goes_nearer(u, bound, before):
-    """Whether a point would be too near a surface, and no farther from it than it was."""
+    """Whether a point is too near a surface, and no farther from it than before."""
     return (u < FLOOR and u <= before.u) or (bound < LEAST_BOUND and bound <= before.bound)
 
 
 class Grasp(NamedTuple):
-    """What the looks of a tool read and write.
+    """Arguments of a tool's proximity queries: input, state and output.
 
-    cells, of `Cells` with distances, and which of their directories a frame reads; shell, of
-    `Clusters`; place: the grid; follower: a record of FOLLOWER; kept (N,) of POINT; near (2, N) of
-    NEAR, bends (2, N) of BENDS: the near points of two poses, in the order of the points, row
-    `follower.side` at the tool's; met (N,) int64: the points that touch; missed (1 + MOST_MISSED,)
-    int64: the unknown cells, as `felt` has them.
+    cells : `Cells` with distances; which : the frame's directory; shell : `Clusters`; place : the
+    grid; follower : record of FOLLOWER; kept (N,) of POINT; near (2, N) of NEAR, bends (2, N) of
+    BENDS : near points of two poses, in the order of the points, row `follower.side` for the tool's
+    pose; met (N,) int64 : points in contact; missed (1 + MOST_MISSED,) int64 : unknown cells, as in
+    `feeling.felt`.
     """
 
     cells: Any
@@ -234,7 +234,7 @@ class Grasp(NamedTuple):
 
 @leaf
 def _look_at_run(grasp, run, transform, center):
-    """Look at the points of run number `run` -> OPEN, SHUT or MANY; see `look`."""
+    """Evaluate the due points of run number `run` -> OPEN, SHUT or MANY, as in `look`."""
     cells, which, shell, place, follower, kept, _, _, _, missed = grasp
     seen, points = seen_in(cells, which, cells.words), shell.points
     start, end = run * shell.run, min((run + 1) * shell.run, points.shape[0])
@@ -258,7 +258,7 @@ def _look_at_run(grasp, run, transform, center):
             follower.n_unknown += 1
             point.due = run_due = -NEVER
             continue
-        if n & (merged - 1):  # another point's contact stands for this one
+        if n & (merged - 1):  # represented by another point's contact
             bound = bound_at(payload, slot, mask, at)
             if bound >= LEAST_BOUND:
                 point.due = travelled + bound - FAR
@@ -291,16 +291,16 @@ def _look_at_run(grasp, run, transform, center):
 
 @leaf
 def rest_of_sphere(seen, spheres, run, transform, place):
-    """Voxels that a run's sphere may go before a point of it can be near; not above 0 if one is."""
+    """Voxels a run's sphere may travel before a point in it can be near; at most 0 if one may."""
     x, y, z = in_voxels(transform, place, spheres[run, 0], spheres[run, 1], spheres[run, 2])
     return room_around(seen, x, y, z, spheres[run, 3] / place.size + FAR, LONGEST_REST, place.side)
 
 
 @leaf
 def _look_at_due_runs(grasp, transform, center, way):
-    """Look at the points of all runs that are due -> OPEN, SHUT or MANY.
+    """Evaluate the points of all due runs -> OPEN, SHUT or MANY.
 
-    The sphere of a run that was near at the last look, a way ago, is not tested.
+    The sphere of a run already due at the last query, `way` voxels ago, is not tested.
     """
     cells, which, shell, place, follower, kept, _, _, _, missed = grasp
     travelled = follower.travelled
@@ -324,15 +324,17 @@ def _look_at_due_runs(grasp, transform, center, way):
 
 @leaf
 def look(grasp, pose, way, is_walking):
-    """Look at the tool at a pose (4, 4) -> OPEN, SHUT or NOT_KNOWN.
+    """Proximity query of the tool at a pose (4, 4) -> OPEN, SHUT or NOT_KNOWN.
 
-    way: voxels that the farthest point has moved since the last look. is_walking: SHUT if a point
-    is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's pose. The near
-    points go into the row of `near` that the tool's pose does not use; SHUT leaves it unfinished. A
-    GPU may look instead (`kernels.gpu.looks`): then it is called. Its sessions merge
-    contacts: where `merges_from` points are near, one contact stands for 2, 4, 8 ... neighbours by
-    index, up to `MOST_MERGED`. Of the others only the bounds are computed, so that no point passes
-    a surface. The processor does the same here, as the oracle of the GPU.
+    way : path length of the farthest point since the last query, voxels. is_walking : SHUT if a
+    point is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's pose. The
+    near points go into the other row of `near`, not that of the tool's pose; SHUT leaves it
+    incomplete.
+
+    A GPU may run the query instead (`kernels.gpu.looks`), through `follower.looker`. Its sessions
+    merge contacts: from `merges_from` near points on, one contact represents 2, 4, 8 ... neighbours
+    by index, up to `MOST_MERGED`. Of the others only the bounds are computed, so no point crosses a
+    surface. The CPU merges likewise, as the GPU's test oracle.
     """
     shell, follower, kept = grasp.shell, grasp.follower, grasp.kept
     follower.travelled += way
@@ -359,7 +361,7 @@ def look(grasp, pose, way, is_walking):
 
 @leaf
 def settle(grasp):
-    """Make the pose that was tried the tool's pose: its near points, their onsets."""
+    """Accept the tried pose as the tool's: its near points, their distances and onsets."""
     follower, kept = grasp.follower, grasp.kept
     before, after = grasp.near[follower.side], grasp.near[1 - follower.side]
     m = n = 0
@@ -381,7 +383,7 @@ def settle(grasp):
 
 @leaf
 def take_more_points(grasp):
-    """Let the next look merge half as many contacts, if there is room -> whether it does."""
+    """Halve `follower.merged` for the next query, if few contacts are near -> whether it did."""
     follower, kept = grasp.follower, grasp.kept
     if follower.merged <= 1 or ROOMY * follower.n_near > follower.merges_from:
         return False
@@ -395,7 +397,7 @@ def take_more_points(grasp):
 
 @leaf
 def look_anew(grasp):
-    """Forget all ways, so that the next look looks at every point; near points stay as they are."""
+    """Make every point due at the next query; the near points are unchanged."""
     follower, kept = grasp.follower, grasp.kept
     follower.travelled = follower.astray = 0.0
     follower.anew = POINTS_ANEW
@@ -407,7 +409,7 @@ def look_anew(grasp):
 
 @leaf
 def forget(grasp):
-    """Forget everything about the points, as at the start: each has the full onset."""
+    """Reset all points, as at the start: none is near, and each has the full onset."""
     look_anew(grasp)
     follower, kept = grasp.follower, grasp.kept
     follower.n_near = follower.n_tried = 0
@@ -418,7 +420,7 @@ def forget(grasp):
 
 @leaf
 def least_distance(grasp):
-    """Least distance of the near points at the tool's pose, voxels; h without any."""
+    """Least distance of the near points at the tool's pose, voxels; HALF_WIDTH without any."""
     near, least = grasp.near[grasp.follower.side], HALF_WIDTH
     for m in range(grasp.follower.n_near):
         least = min(least, near[m].u)
@@ -427,7 +429,7 @@ def least_distance(grasp):
 
 @leaf
 def fix_onsets(grasp):
-    """Let each near point's contact begin where it is now, at most at the full onset."""
+    """Begin each near point's contact at its present distance, at most at the full onset."""
     near = grasp.near[grasp.follower.side]
     for m in range(grasp.follower.n_near):
         grasp.kept[near[m].point].onset = min(near[m].u, ONSET)

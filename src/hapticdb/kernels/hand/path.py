@@ -1,8 +1,8 @@
-"""The way of a step: in strides so short that no point can pass a surface unseen.
+"""Conservative advancement along a step: no point crosses a surface.
 
-Every stride is shorter than the lower bound of the distance of every point to every surface
-(`near_points`), along the exact screw motion of the step. So a point never gets from one side of a
-sheet to the other, however thin the sheet is and however fast the hand moves.
+Every advance is shorter than a lower bound of the distance from any point to any surface
+(`near_points`), along the exact screw motion of the step. So no point reaches the other side of a
+sheet, however thin the sheet and however fast the hand.
 """
 
 import math
@@ -23,21 +23,20 @@ from hapticdb.kernels.rigid import (
 )
 
 STRIDE = 0.98
-"""Length of a stride, in lower bounds of the least distance. Larger: fewer looks; below 1, or the
-proof is lost."""
+"""Length of an advance, in lower bounds of the least distance. Larger: fewer queries; 1 or more
+voids the proof."""
 LEAST_STRIDE = 0.02
-"""Voxels: the clearance that a stride counts with at least. Only points that lie in a surface have
-less."""
+"""Least clearance assumed for an advance, voxels. Only points inside a surface have less."""
 SHORTEST = 0.02
-"""Share of a stride below which it is not halved any more. Smaller: more looks at an obstacle."""
+"""Least share of an advance after halvings. Smaller: more queries at an obstacle."""
 MOST_LOOKS = 96
-"""Most poses that a period looks at. Larger: a faster hand is followed in one period, and the worst
+"""Most poses queried in a period. Larger: a faster hand is followed in one period, and the worst
 period takes longer."""
 
 
 @leaf
 def turned_on(step, share, before):
-    """Quaternion after a share of the step's turn, not normalised, and its length."""
+    """Quaternion after a share of the step's rotation, not normalised, and its norm."""
     w, x, y, z = product(
         *quaternion_by(share * step[3], share * step[4], share * step[5]),
         before[0], before[1], before[2], before[3],
@@ -47,7 +46,7 @@ def turned_on(step, share, before):
 
 @leaf
 def place_on_way(tool, center, follower, done):
-    """Tool's pose at a share of the step, into tool.tried_pose -> position and quaternion."""
+    """Tool's pose at a share of the step, into tool.tried_pose; return position and quaternion."""
     step, pose = follower.step, tool.tried_pose
     w, x, y, z, length = turned_on(step, done, tool.quaternion)
     scale = 1.0 / length
@@ -63,15 +62,15 @@ def place_on_way(tool, center, follower, done):
 
 @leaf
 def way_of_step(follower, radius, size):
-    """Way that no point exceeds in the whole step, voxels."""
+    """Upper bound of any point's path length in the whole step, voxels; radius, size : m."""
     return (length_at(follower.step, 0) + radius * length_at(follower.step, 3)) / size
 
 
 @leaf
 def _stride_on(grasp, way, done, tool):
-    """Make one stride from share `done` of the step -> where the tool is then, and what was found.
+    """Advance once from share `done` of the step; return the new share and the query's result.
 
-    SHUT: not even a short stride is allowed, or the period has no looks left.
+    SHUT : even the shortest advance is blocked, or the period has no queries left.
     """
     follower = grasp.follower
     stride = min(1.0 - done, STRIDE * max(follower.clearance, LEAST_STRIDE) / max(way, 1e-300))
@@ -93,7 +92,7 @@ def _stride_on(grasp, way, done, tool):
 
 @leaf
 def keep_pose(tool, follower, at):
-    """Make a pose of seven numbers the tool's, which the near points belong to."""
+    """Set the pose of the tool and of its near points to `at`: position and quaternion."""
     pose_of_quaternion(*at, tool.pose)
     set_numbers(tool, at)
     for n in range(7):
@@ -102,9 +101,9 @@ def keep_pose(tool, follower, at):
 
 @leaf
 def walk(grasp, radius, tool):
-    """Walk the step as far as the tool may go -> share of the step, and what the last look found.
+    """Advance along the step up to an obstacle; return the share done and the last query's result.
 
-    radius, m: distance of the farthest point from the tool's centre.
+    radius : m, from the tool's centre to its farthest point.
     """
     follower = grasp.follower
     way = way_of_step(follower, radius, grasp.place.size)

@@ -1,9 +1,9 @@
 """Virtual coupling with contact constraints, quasi-static: spring and contacts balance each period.
 
-The tool has a pose and no velocity. Each period moves it to the pose that minimises the energy of
-the spring to the hand and of the contacts with the distance field (`step`), by Gauss-Newton steps
-that are walked in strides (`path`). The hand feels the spring. So it never feels more than the
-spring's stiffness, whatever the voxel size, the number of points and the contacts' stiffness.
+The tool has a pose and no velocity. Each period moves it to the minimum of the energy of the spring
+to the hand and of the contacts with the distance field (`step`), by Gauss-Newton steps under
+conservative advancement (`path`). The force on the hand is the spring's. So the stiffness at the
+hand never exceeds the spring's, for any voxel size, number of points and contact stiffness.
 
 It needs resident cells with distances.
 """
@@ -59,31 +59,31 @@ from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, WRENCH
 from hapticdb.kernels.rigid import numbers_of, pose_of_quaternion
 
 IS_LOOSE, IS_SOFTER, IS_SNAPPING, IS_ANEW = 64, 128, 256, 512
-"""Marks of a period, beside those of `holding`: the tool lies in something and feels nothing; the
-guard has lowered the stiffness; the change of the force is softened; the cells have changed."""
+"""Marks of a period, besides those of `holding`: tool inside an obstacle, without contacts;
+stiffness lowered by the guard; change of the force limited; cells changed."""
 
 STEPS = 3
 """Most Gauss-Newton steps of a period. Larger: sharper corners are followed in one period, and the
 worst period takes longer."""
 ROUNDS = 6
-"""Most times that the equations of a step are solved until the contact set stays the same. Larger:
-the set is right more often in corners, and the worst period takes longer."""
+"""Most solutions of a step's equations until the contact set is stable. Larger: the set is right
+more often in corners, and the worst period takes longer."""
 SETTLED = 5e-3
-"""Voxels: a step in which no point moves farther is not walked, and the force is that at its end.
-Larger: fewer looks, and the tool's pose and the force's direction are less exact."""
+"""Steps in contact with shorter paths of all points, voxels, are not done: the force is that at
+their end. Larger: fewer queries, and the tool's pose and the force's direction are less exact."""
 BENT_FROM = 2
-"""Steps of a period after which the surface's curvature is computed, too, until it is flat. Larger:
+"""Steps of a period before the surface's curvature enters the equations, until it is flat. Larger:
 less computing, and more steps in corners."""
 SHORT_CUT = 0.1
-"""Share of a step: if less of it was walked, the next step is braked. Larger: braked more often."""
+"""If less than this share of a step was done, the next one is braked. Larger: braked more often."""
 SUNK = 0.02
-"""Voxels by which a point must be nearer in a new version of the cells, and nearer than FLOOR, so
-that something was put upon the tool."""
+"""Least approach of a surface, voxels, by a new version of the cells. A distance also below FLOOR -
+SUNK means an object put upon the tool."""
 
 
 @leaf
 def has_moved(tool, follower):
-    """Whether the tool is not at the pose that the near points belong to."""
+    """Whether the tool is not at the pose of its near points."""
     at, count = numbers_of(tool), 0
     for n in range(7):
         count += at[n] != follower.looked_at[n]
@@ -92,10 +92,10 @@ def has_moved(tool, follower):
 
 @leaf
 def _meet_change(grasp):
-    """Compare the last look with the one before, at the same pose in an older version of the cells.
+    """Compare the last query with the one before, at the same pose in older cells.
 
-    Where a surface has come nearer, contact begins at the present distance, so that no force jumps.
-    Returns whether a point now lies in something.
+    Contact with an approached surface begins at the present distance, so no force jumps. Returns
+    whether a point is now inside an object.
     """
     near = grasp.near[1 - grasp.follower.side]
     is_sunk = False
@@ -109,7 +109,7 @@ def _meet_change(grasp):
 
 @leaf
 def _look_here(grasp, tool):
-    """Look at the tool where it is, at the start or in a new version -> whether all is known."""
+    """Query the tool's pose, at the start or in new cells; False with points in unknown cells."""
     follower, is_first = grasp.follower, tool.version == 0
     if is_first:
         forget(grasp)
@@ -133,10 +133,10 @@ def _look_here(grasp, tool):
 
 @leaf
 def _look_at_more(grasp, tool):
-    """Look where the tool is, at contacts merged before -> OPEN or NOT_KNOWN.
+    """Query the tool's pose, with contacts merged before -> OPEN or NOT_KNOWN.
 
-    A point that comes back feels contact from where it is, so that no force jumps. It goes no
-    nearer to a surface than it is, if it is nearer than FLOOR.
+    Contact of a returning point begins at its present distance, so no force jumps. A point nearer
+    than FLOOR gets no nearer to a surface.
     """
     pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
     found = look(grasp, tool.tried_pose, grasp.follower.astray, np.bool_(False))
@@ -148,7 +148,10 @@ def _look_at_more(grasp, tool):
 
 @leaf
 def _follow_loosely(grasp, spring, tool, hand):
-    """Put a tool that lies in something at the hand -> OPEN or NOT_KNOWN."""
+    """Move a tool inside an obstacle to the hand -> OPEN or NOT_KNOWN.
+
+    Contacts begin once no point is nearer than FLOOR to a surface.
+    """
     follower, center = grasp.follower, grasp.shell.center
     measure_pull(spring, tool, hand, tool.pose, center, follower)
     for axis in range(6):
@@ -169,9 +172,9 @@ def _follow_loosely(grasp, spring, tool, hand):
 
 @leaf
 def follow(grasp, spring, tool, hand):
-    """Move the tool to where spring and contacts balance -> what the last look found.
+    """Move the tool to the balance of spring and contacts; return the last query's result.
 
-    SHUT: the tool is held back, by a surface or because the period has no looks left.
+    SHUT : the tool is stopped by a surface, or the period has no queries left.
     """
     follower, size, most = grasp.follower, grasp.place.size, BEYOND_CAP * spring.cap
     stiffness = contact_stiffness(spring, size)
@@ -200,9 +203,9 @@ def follow(grasp, spring, tool, hand):
 
 @leaf
 def _record_felt(grasp, stiffness, felt):
-    """Contacts at the tool's pose: indices into grasp.met, wrench on the tool and counts into felt.
+    """Contacts at the tool's pose: points into grasp.met, wrench on the tool, counts into `felt`.
 
-    Hits are the near points that push or are about to; contacts are those that push.
+    Hits are the near points in the contact set or with a force; contacts are those with a force.
     """
     follower, near, deepest = grasp.follower, grasp.near[grasp.follower.side], 0.0
     n_hits = n_contacts = 0
@@ -228,7 +231,7 @@ def _record_felt(grasp, stiffness, felt):
 
 @leaf
 def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
-    """Wrench on the hand at the device, about the handle's origin, into wrench (6,) -> flags."""
+    """Wrench on the hand at the device, about the handle's origin, into wrench (6,) -> marks."""
     for axis in range(6):
         wrench[axis] = 0.0
     force = 0.0
@@ -258,11 +261,11 @@ def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
 
 @leaf
 def finish(grasp, spring, servo, is_held, found, dt):
-    """Send the wrench and the marks of the period; contacts into tool.felt."""
+    """Send the period's wrench and marks; contacts into `tool.felt`."""
     flags, tool, hand, wrench = 0, servo.tool, servo.hand, servo.sent.wrench
     follower = grasp.follower
     if is_held:
-        follower.n_trail = 0  # a speed over a gap says nothing
+        follower.n_trail = 0  # a speed across a gap has no meaning
     else:
         remember_hand(follower, hand, dt)
         is_over = follower.n_looks >= MOST_LOOKS
@@ -279,7 +282,7 @@ def finish(grasp, spring, servo, is_held, found, dt):
 
 @leaf
 def _move_tool(grasp, version, spring, tool, hand):
-    """Move the tool after the hand, in the present version of the cells -> what was found."""
+    """Move the tool after the hand, in a version of the cells -> result of the last query."""
     found = OPEN
     if tool.version != version or has_moved(tool, grasp.follower):
         if not _look_here(grasp, tool):
@@ -298,24 +301,25 @@ def _move_tool(grasp, version, spring, tool, hand):
 def advance(grasp, version, spring, servo, dt):
     """Move the tool for one period of dt seconds, in a version of the cells.
 
-    servo, a record of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
-    grasp.missed between periods. Follower, kept and near are the coupling's own from period to
-    period; it starts anew, whatever they hold, while `tool.version` is 0. The caller may put the
-    tool back to an earlier pose, but must not put back these three.
+    servo : record of SERVO, with `hand` as input, `tool` and `sent` as output. `follower`, `kept`
+    and `near` are the coupling's own from period to period; while `tool.version` is 0, it ignores
+    their contents and starts anew. The caller preserves `grasp.missed` between periods. It may
+    reset the tool to an earlier pose, but not these three.
 
-    If a step would take points into unknown cells, the tool stays before it. The wrench is kept for
-    `hold` seconds, then falls to zero within `fade` seconds; sent.unknown and missed then belong
-    to the pose that was tried. After that, and after the first frame, the wrench rises to its full
-    size within `fade` seconds and at least RISE_FRAMES frames. While the clutch is open the wrench
-    falls to zero, and the tool still follows the handle. While the hand is not finite, tool and
-    wrench are held; a tool that is not finite is placed at the first finite hand.
+    The tool stops before a step into unknown cells. The last wrench is sent for `hold` seconds,
+    then falls to zero within `fade` seconds; `sent.unknown` and `missed` then belong to the tried
+    pose. Afterwards, and after the first frame, the wrench rises to its full size within `fade`
+    seconds and at least RISE_FRAMES frames. With an open clutch the wrench falls to zero, and the
+    tool still follows the handle. With a non-finite hand, tool and wrench stay; a non-finite tool
+    moves to the first finite hand.
 
-    `sent.wrench` is the wrench for the device, in the device's units, about the handle's origin: a
-    force of min(k |x|, cap) against the way x from tool to hand, changed by the damper along it;
-    the torque is that of this force at the tool's centre, and of the turning spring. It is exactly
-    zero while no point touches or is held back. `tool.felt` has the contacts' wrench on the tool,
-    N and N m of the scene, and their counts. `sent.hits` points are in grasp.met: those that push,
-    which `sent.contacts` counts, and those about to. `sent.deepest`: onset less distance, m.
+    `sent.wrench` is the wrench at the device, in its units, about the handle's origin: a force of
+    min(k |x|, cap) against the stretch x from tool to hand, changed by the damper along it; the
+    torque is the moment of this force at the tool's centre, plus that of the rotational spring.
+    Without a contact or an obstacle it falls to exactly zero, as fast as `soften_change` allows.
+    `tool.felt` has the contacts' wrench on the tool, N and N m of the scene, and their counts.
+    `grasp.met` has `sent.hits` points: the `sent.contacts` with a force, and those about to have
+    one. `sent.deepest` is onset less distance, m.
     """
     dt = max(dt, 0.0)
     tool, hand, sent, follower = servo.tool, servo.hand, servo.sent, grasp.follower

@@ -1,4 +1,4 @@
-"""What keeps the force stable: damping along it, a guard against shaking, and soft snap-off."""
+"""Stability of the force: damping along it, oscillation guard, and limited rate of change."""
 
 import math
 
@@ -6,32 +6,32 @@ from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.records import MOST_TRAIL
 
 WINDOW = 4e-3
-"""Seconds over which the hand's speed is measured. Larger: later damping; at one sample of a
-device's steps the damper chatters."""
+"""Seconds of the hand's speed measurement. Larger: later damping; over one sample, a device's
+position steps make the damper chatter."""
 TRAIL_STEP = WINDOW / (MOST_TRAIL - 8)
-"""Least seconds between two remembered places of the hand. It follows from `WINDOW`."""
+"""Least seconds between two stored positions of the hand, from `WINDOW`."""
 REVERSAL = 0.3
-"""Newtons by which a force must turn back to count as a reversal. Larger: smaller shaking is not
-seen."""
+"""Least return of the force from an extreme, N, for a reversal. Larger: smaller oscillations
+pass."""
 FORGOTTEN = 0.1
-"""Seconds in which reversals are forgotten (the time constant). Larger: slower shaking is seen, and
-quick taps count, too."""
+"""Time constant of the reversals' decay, s. Larger: slower oscillations are detected, and quick
+taps count, too."""
 MOST_REVERSALS = 3.0
-"""Reversals above which the guard acts. Larger: shaking lasts longer before it does."""
+"""Most decayed reversals without action of the guard. Larger: longer oscillations."""
 SOFTER = 0.8
-"""Factor of the stiffness each time that the guard acts."""
+"""Factor on the stiffness at each action of the guard."""
 LEAST_SHARE = 0.2
-"""Least share of the stiffness that the guard leaves."""
+"""Least share of the stiffness under the guard."""
 SHARE_RATE = 10.0
-"""Change of that share a second. Larger: the guard acts sooner, and the force changes faster."""
+"""Fall of this share, 1/s. Larger: the guard acts sooner, and the force changes faster."""
 MOST_CHANGE = 1000.0
-"""Newtons a second by which a force may change beyond what the hand's own motion makes of it, when
-the tool snaps off an edge or from one face to another. Larger: sharper edges, harder snaps."""
+"""Greatest rate of a force, N/s, on top of the change by the hand's motion, when the tool snaps off
+an edge or from one face to another. Larger: sharper edges, harder snaps."""
 
 
 @leaf
 def begin_steady(follower):
-    """Start without memory of the hand, at the full stiffness."""
+    """Reset the trail of the hand and the guard, with the full stiffness."""
     follower.n_trail = 0
     follower.clock = follower.reversals = follower.extreme = 0.0
     follower.share = follower.wanted_share = 1.0
@@ -40,7 +40,7 @@ def begin_steady(follower):
 
 @leaf
 def remember_hand(follower, hand, dt):
-    """Add the handle's place to the trail."""
+    """Append the handle's position to the trail, at most once in TRAIL_STEP."""
     trail, position = follower.trail, hand.position
     follower.clock += dt
     newest = (follower.n_trail - 1) % MOST_TRAIL
@@ -75,9 +75,9 @@ def hand_speed(follower, hand, x, y, z):
 
 @leaf
 def guard_stiffness(follower, force, dt):
-    """Count the force's reversals and lower the stiffness when there are many -> whether it did.
+    """Count the force's reversals and lower the stiffness after many; return whether it did.
 
-    force: N, of the spring alone.
+    force : N, of the spring alone.
     """
     follower.reversals *= math.exp(-dt / FORGOTTEN)
     ahead = force - follower.extreme
@@ -98,7 +98,7 @@ def guard_stiffness(follower, force, dt):
 def soften_change(kept, wrench, allowed):
     """Limit the change of force from kept (6,) to wrench (6,), in place -> whether it was limited.
 
-    allowed: the greatest change, N. The torque makes the same share of its way.
+    allowed : greatest change, N. The torque changes by the same share.
     """
     x, y, z = wrench[0] - kept[0], wrench[1] - kept[1], wrench[2] - kept[2]
     change = math.sqrt(x * x + y * y + z * z)

@@ -57,7 +57,7 @@ def _solve(follower):
 
 @leaf
 def _begin_equations(follower, extra, turn_extra):
-    """Set the step's equations to the springs alone, and `extra` stiffness that only brakes."""
+    """Set the step's equations to the springs alone; the `extra` stiffness only brakes."""
     matrix, right, pull, pulls = follower.matrix, follower.right, follower.pull, follower.pulls
     for row in range(6):
         for column in range(row):
@@ -71,7 +71,7 @@ def _begin_equations(follower, extra, turn_extra):
 
 @leaf
 def _predict_contacts(grasp):
-    """Put the near points that the step leaves in depth into the contact set -> whether it changed.
+    """Update the contact set to the near points with depth after the step -> whether it changed.
 
     The depth after the step is d_i - J_i . step, metres.
     """
@@ -96,9 +96,9 @@ def _predict_contacts(grasp):
 def _add_bends(follower, weight, bends):
     """Add the resistance of a hollow surface across the gradient of a near point.
 
-    It is the part of the energy's second derivative that Gauss-Newton leaves out, -K d u'', where
-    it is positive. Without it steps in corners overshoot as soon as the force over the voxel size
-    exceeds the spring's stiffness.
+    Gauss-Newton omits this part of the energy's second derivative, -K d u''; it is added if
+    positive. Without it steps in corners overshoot as soon as the force over the voxel size exceeds
+    the spring's stiffness.
     """
     for bend in range(2):
         curvature = bends.curvature[bend]
@@ -111,9 +111,9 @@ def _add_bends(follower, weight, bends):
 def solve_step(grasp, stiffness, extra, turn_extra, rounds):
     """Solve for the step (6,), m and rad about the centre, and its contact set.
 
-    grasp.follower has e and theta in `pull`, and their stiffnesses in `pulls`; stiffness: of a
-    contact, N/m; rounds: most times that the equations are solved until the contact set stays the
-    same.
+    grasp.follower : e and theta in `pull`, their stiffnesses in `pulls`; stiffness : of a contact,
+    N/m; extra, turn_extra : stiffnesses of the brake; rounds : most solutions of the equations
+    until the contact set is stable.
     """
     follower, near = grasp.follower, grasp.near[grasp.follower.side]
     follower.n_bends = 0

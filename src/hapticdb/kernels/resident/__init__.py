@@ -1,4 +1,4 @@
-"""Kernels of resident cells: the table in shared memory, the frames and searches that read it."""
+"""Kernels of resident cells: the table in shared memory, with its frames and searches."""
 
 from hapticdb.kernels._later import later_modules
 

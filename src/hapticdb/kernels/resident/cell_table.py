@@ -46,12 +46,12 @@ from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import transform_of
 
 NEVER_AGAIN = 0x7FFFFFFFFFFFFFFF
-"""`wanted_at` of a slot that is already chosen for freeing: later than every `since`."""
+"""`wanted_at` of a slot already chosen for eviction: later than every `since`."""
 
 
 @entry(INTS2, INTS32_2, INT, INTS, INTS)
 def insert_cells(keys, slots, which, new_keys, new_slots):
-    """Enter cells (n,) in directory `which`; cells that are there already get the new slots."""
+    """Insert cells (n,) into directory `which`, or replace their slots."""
     for n in range(new_keys.shape[0]):
         at = place_in_set(keys[which], new_keys[n])
         slots[which, at] = new_slots[n]
@@ -60,7 +60,7 @@ def insert_cells(keys, slots, which, new_keys, new_slots):
 
 @entry(INTS2, INTS32_2, INT, INTS)
 def remove_cells(keys, slots, which, old_keys):
-    """Remove cells (n,) from directory `which`; later entries of the same run move up."""
+    """Remove cells (n,) from directory `which`, by backward-shift deletion."""
     capacity = keys.shape[1]
     for n in range(old_keys.shape[0]):
         at = hole = place_in_set(keys[which], old_keys[n])
@@ -71,7 +71,7 @@ def remove_cells(keys, slots, which, old_keys):
             if keys[which, at] < 0:
                 break
             home = spread_key(keys[which, at], capacity)
-            # move an entry only if its search, from its home, passes the hole (going round)
+            # move an entry only if its probes, from its home, pass the hole (modulo capacity)
             if ((at - home) & (capacity - 1)) >= ((at - hole) & (capacity - 1)):
                 keys[which, hole] = keys[which, at]
                 slots[which, hole] = slots[which, at]
@@ -81,20 +81,20 @@ def remove_cells(keys, slots, which, old_keys):
 
 @entry(INTS2, INTS32_2, INT, INTS, INTS)
 def slots_of_cells(keys, slots, which, asked, out):
-    """Write slots (n,) of cells (n,) in directory `which`, UNKNOWN for a cell without an entry."""
+    """Slots (n,) of cells (n,) in directory `which`; UNKNOWN for a cell without an entry."""
     for n in range(asked.shape[0]):
         out[n] = slot_of(keys, slots, which, asked[n])
 
 
 @leaf
 def _mark_brick(masks, slot, i, j, k):
-    """Mark the brick that holds voxel (i, j, k) in the mask of its cell's slot."""
+    """Set the bit of the brick with voxel (i, j, k) in the mask of its cell's slot."""
     masks[slot] |= np.uint64(1) << brick_bit(i, j, k)
 
 
 @leaf
 def _fill_brick(words, slot, i, j, k, occupancy, start):
-    """Set the voxels of the brick at (i, j, k), bytes from `start` -> whether it has a voxel."""
+    """Set the voxels of the brick at (i, j, k), bytes from `start`; return whether it has any."""
     has_any = False
     for byte in range(64):
         value = occupancy[start + byte]
@@ -115,8 +115,8 @@ def _fill_brick(words, slot, i, j, k, occupancy, start):
 def fill_cells(row_keys, row_slots, occupancy, bits, curve, words, masks):
     """Fill empty cells from rows of the index table.
 
-    row_keys (R,); row_slots (R,): slot of each row's cell in words (S, 1024) uint32 and masks (S,)
-    uint64, below 0 for a row that is left out; occupancy (64 R,) or empty for voxel rows.
+    row_keys (R,); row_slots (R,) : slot of each row's cell in words (S, 1024) uint32 and masks (S,)
+    uint64, below 0 to skip the row; occupancy (64 R,), or empty for voxel rows.
     """
     has_bits = occupancy.shape[0] > 0
     for row in range(row_keys.shape[0]):
@@ -138,9 +138,9 @@ def fill_cells(row_keys, row_slots, occupancy, bits, curve, words, masks):
 def _merge_row(payload, slot, i, j, k, last, values, row):
     """Lower a slot's distances to those of the brick at (i, j, k), in `row` of values (R, 1000).
 
-    Of the row's outer layer only what lies outside the cell is written. A centre in the cell
-    belongs to a brick of the cell, whose own row has it; without such a row it is BEYOND. last:
-    where the cell's last brick begins on each axis: 24, or less in a grid smaller than a cell.
+    Of the row's outer layer only the part outside the cell is written. A centre in the cell belongs
+    to a brick of the cell, with a row of its own; without such a row it is BEYOND. last : first
+    voxel of the cell's last brick on each axis: 24, or less in a grid smaller than a cell.
     """
     i, j, k = i & 31, j & 31, k & 31
     low_i, low_j = -1 if i == 0 else 0, -1 if j == 0 else 0
@@ -159,12 +159,12 @@ def _merge_row(payload, slot, i, j, k, last, values, row):
 
 @entry(INTS, INTS, BYTES2, INT, INT, INT, BYTES2, WORDS)
 def fill_distances(row_keys, row_slots, values, bits, curve, before, payload, masks):
-    """Fill the distances of cells from rows of the band; `fill_cells` has filled their voxels.
+    """Fill the distances of cells from rows of the band, after `fill_cells` -> last slot filled.
 
     row_keys (R,) of bricks, ascending; values (R, 1000) uint8, unpacked; payload (S, 34^3) uint8;
-    before: the slot that the rows of an earlier call have filled last, or -1; the other arguments
-    are those of `fill_cells`. What a slot held is forgotten when its first row comes; a slot
-    without a row stays as it was, and its mask has no bit. Returns the slot that was filled last.
+    before : slot filled last by the rows of an earlier call, or -1; the other arguments are those
+    of `fill_cells`. A slot's first row resets all its distances to BEYOND; a slot without a row is
+    unchanged, and its mask has no bit.
     """
     last_brick = min(1 << bits, 32) - 8
     for row in range(row_keys.shape[0]):
@@ -183,13 +183,13 @@ def fill_distances(row_keys, row_slots, values, bits, curve, before, payload, ma
 
 
 def curve_keys_of_cells(cells: Ints, bits: int, curve: int) -> Ints:
-    """Keys on the curve (voxel keys >> 15) of cells (n,), given by directory keys."""
+    """Curve keys (voxel keys >> 15) of cells (n,) given by directory keys."""
     ijk = np.stack([cells >> 32, (cells >> 16) & 0xFFFF, cells & 0xFFFF], axis=1)
     return encode(ijk, max(bits - 5, 0), curve)
 
 
 def cells_of_curve_keys(curve_keys: Ints, bits: int, curve: int) -> Ints:
-    """Directory keys of cells (n,) on the curve; undoes `curve_keys_of_cells`."""
+    """Directory keys of cells (n,) given by curve keys; inverse of `curve_keys_of_cells`."""
     i, j, k = decode(curve_keys, max(bits - 5, 0), curve).T
     cells: Ints = (i << 32) | (j << 16) | k
     return cells
@@ -197,11 +197,11 @@ def cells_of_curve_keys(curve_keys: Ints, bits: int, curve: int) -> Ints:
 
 @entry(INTS, INTS, BYTES, INT, INT, INT, INTS)
 def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
-    """Clock eviction: choose slots of cells that no frame has used since the hand last passed.
+    """Clock eviction: choose slots unused by frames since the last pass of the clock's hand.
 
-    cell_of_slot (S,) int64, -1 where free; wanted_at (S,) int64: slots wanted at `since` or later
-    stay; used (S,) uint8 is cleared as the hand passes. hand is the slot at which the clock's hand
-    is. Up to `wanted` slots go into out. Returns their number and the new hand.
+    cell_of_slot (S,) int64, -1 if free; wanted_at (S,) int64 : slots requested at `since` or later
+    stay; used (S,) uint8 : cleared by the pass of the hand; hand : slot of the clock's hand; out :
+    up to `wanted` slots. Returns their number and the new hand.
     """
     total = cell_of_slot.shape[0]
     count = 0
@@ -224,7 +224,7 @@ def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
 
 @entry(INTS, INT, INT)
 def publish(control, version, revision):
-    """Publish a directory that is complete in its buffer: new frames read it from now on."""
+    """Publish a version's directory, complete in its buffer: new frames read it from now on."""
     control[REVISION + version % BUFFERS] = revision
     fence()
     control[VERSION] = version
@@ -233,7 +233,7 @@ def publish(control, version, revision):
 
 @entry(INTS)
 def oldest_version_read(readers):
-    """Lowest version that a frame is reading; the largest int64 when no frame is reading."""
+    """Lowest version among frames in progress; the largest int64 without any."""
     fence()
     oldest = np.int64(0x7FFFFFFFFFFFFFFF)
     for n in range(0, readers.shape[0], READER_STRIDE):
@@ -244,12 +244,12 @@ def oldest_version_read(readers):
 
 @entry(INTS, INTS, FLOATS, FLOATS, FLOAT, FLOAT, INTS, FLOATS)
 def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
-    """Cells of a box that a sphere comes near on a straight way, and the urgency of each.
+    """Cells of a box near a sphere's straight path, and the urgency of each.
 
-    first, last (3,) int64: the box, in cells, both included; start, move (3,), radius: the sphere's
-    way; margin: the largest distance that counts as near; all in voxels. keys (n,) and urgency (n,)
-    take the cells. The urgency is the way to the sphere's nearest position plus the distance there,
-    in voxels, 0 for a cell that the sphere meets already. Returns the number of cells.
+    first, last (3,) int64 : the box, in cells, both included; start, move (3,), radius : the
+    sphere's path; margin : greatest distance that counts as near; all in voxels; keys (n,), urgency
+    (n,) : output. The urgency is the path length to the sphere's nearest position plus the distance
+    there, in voxels, 0 for a cell in the sphere at the start. Returns the number of cells.
     """
     length = move[0] * move[0] + move[1] * move[1] + move[2] * move[2]
     way = np.sqrt(length)
@@ -289,9 +289,9 @@ def cells_met(points, first, least, reach, poses, place, found, most):
     """Distinct cells within `reach` voxels of points (N, 3+) at the first of poses (M, 4, 4).
 
     At poses[0] only points from `first` on count. The cells go into found (capacity,) int64, an
-    open-addressing set, all -1 before; its capacity is a power of two. The search ends before there
-    are more than `most` cells, but not before point `least` of the first pose. Returns the number
-    of poses of which all cells are there, and the number of cells.
+    open-addressing set, all -1 before; its capacity is a power of two. The search ends before more
+    than `most` cells, but not before point `least` of the first pose. Returns the number of
+    complete poses, and of cells.
     """
     end, count = place.side + reach, np.int64(0)
     memo = cells_of_box(-1.0, -1.0, -1.0, 0.0, place.side)

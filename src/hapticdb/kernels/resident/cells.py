@@ -1,20 +1,19 @@
-"""Resident cells: a frame reads voxels in memory and never waits for a database.
+"""Resident cells: voxels in shared memory, read by frames without waiting for a database.
 
-A cell is 32^3 voxels, held as 1024 words: word ``(i & 31) << 5 | (j & 31)``, bit ``k & 31``. A
-directory, an open-addressing table, maps a cell to its slot. Slot 0 is always empty and is the slot
-of every cell that is known to be empty; a cell without an entry is *unknown*. Besides its words
-each slot has a mask of 64 bits, one for each of its 4^3 bricks; a bit is set if the brick holds a
-voxel.
+A cell has 32^3 voxels in 1024 words: word ``(i & 31) << 5 | (j & 31)``, bit ``k & 31``. A
+directory, an open-addressing hash table, maps a cell to its slot. Slot 0 is always empty, and the
+slot of every empty cell; a cell without an entry is *unknown*. Each slot also has a 64-bit mask of
+its 4^3 bricks; the bit of a brick with a voxel is set.
 
 A table with distances also has, for each slot, the least distance of all objects at 34^3 voxel
-centres: the cell's own and one more on each side (`hapticdb.kernels.field.lattice`). There a
-brick's bit is also set if the brick has a row of the band, and a cell without a voxel takes a slot.
-A second array of words, `near`, has the bit of a voxel set if a point in it may count under the
-distance law (`near_voxels`). A frame reads one bit there before it looks up distances.
+centres: the cell's own and one more on each side (`hapticdb.kernels.field.lattice`). There a brick
+with a row of the band has its bit, too, and a cell without a voxel takes a slot. A second array of
+words, `near`, has a bit for each voxel in range of the distance law (`near_voxels`): a frame tests
+one bit there before it interpolates distances.
 
-Directories are published in versions, three buffers in turn. A frame announces which version it
-reads and uses only that one, so it never reads a half-changed directory. The writing process reuses
-a buffer or a slot only when no frame can still read it (`hapticdb.resident.table`).
+Directories are published in versions, in three buffers in turn. A frame announces its version and
+reads no other, so never a half-changed directory. The writing process reuses a buffer or a slot
+only when no frame can still read it (`hapticdb.resident.table`).
 """
 
 from typing import NamedTuple
@@ -51,33 +50,32 @@ BUFFERS = 3
 UNKNOWN = -1
 EMPTY_SLOT = 0
 VERSION = 0
-"""Index into `Cells.control`: the number of the published version."""
+"""Index into `Cells.control` of the published version."""
 REVISION = 1
 """First index into `Cells.control` of the database's revisions, one for each buffer."""
 CONTROL_WORDS = 16
 """Length of `Cells.control`: two cache lines."""
 READER_STRIDE = 8
-"""Numbers from one reader to the next: a cache line, so readers do not slow one another down."""
+"""Numbers from one reader to the next: a cache line, against false sharing."""
 FELT_REVISION = 1
-"""Index into a reader's numbers: the database's revision of the cells that its last frame read."""
+"""Index into a reader's numbers: the database's revision of the cells of its last frame."""
 LISTED = 0
-"""Index into a frame's list of unknown cells: their number. Their keys follow."""
+"""Index into a frame's list of unknown cells: their number, before their keys."""
 GROUP, BLOCK = 4, 64
-"""Runs in a group and in a block, which are skipped at once where they are far from every voxel.
-Larger ones are seldomer far."""
+"""Runs in a group and in a block, culled by one bounding sphere. Larger: culled less often."""
 WRENCH, HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 0, 6, 7, 8, 9, 10
 """Indices into a frame's result (RESULTS,) float64."""
 
 
 class Cells(NamedTuple):
-    """A table of cells, as `hapticdb.resident.table.CellTable` lays it out in shared memory.
+    """Cell table in shared memory, laid out by `hapticdb.resident.table.CellTable`.
 
-    control (CONTROL_WORDS,) int64; readers (R x 8,) int64, the version that each reader reads, 0
-    for none;
-    keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
-    uint32; masks (slots,) uint64; used (slots,) uint8, set by a frame that reads the slot; payload
-    (slots, 34^3) uint8: stored distances, all BEYOND in slot 0; near (slots, 1024) uint32: voxels
-    in which a point may count under the distance law; both are None in a table without distances.
+    control (CONTROL_WORDS,) int64; readers (R x 8,) int64 : version of each reader, 0 for none;
+    keys (3, capacity) int64 and slots (3, capacity) int32 : directories; words (slots, 1024)
+    uint32; masks (slots,) uint64; used (slots,) uint8 : set by frames at a read of the slot;
+    payload (slots, 34^3) uint8 : stored distances, all BEYOND in slot 0; near (slots, 1024)
+    uint32 : voxels in range of the distance law. The last two are None in a table without
+    distances.
     """
 
     control: Ints
@@ -102,9 +100,9 @@ CELLS_WITH_DISTANCES = fields_of(
 
 
 class Seen(NamedTuple):
-    """Voxels as one frame sees them: arrays of `Cells`, and which of the directories it reads.
+    """Voxels for one frame: arrays of `Cells`, and the number of its directory.
 
-    words: those of the occupied voxels, or of the near ones (`near_voxels`).
+    words : of the occupied voxels, or of the near ones (`near_voxels`).
     """
 
     keys: NDArray[np.int64]
@@ -116,7 +114,7 @@ class Seen(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A grid for kernels: origin x, y, z and voxel size in metres, voxels on each axis (side)."""
+    """Grid for kernels: origin x, y, z and voxel size in metres, voxels on each axis (side)."""
 
     x: float
     y: float
@@ -129,17 +127,17 @@ PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 
 SCRATCH_ROWS = 24
-"""Rows of `Clusters.scratch`, which `runs.Scratch` names."""
+"""Rows of `Clusters.scratch`, named in `runs.Scratch`."""
 
 
 class Clusters(NamedTuple):
-    """A shell in the form that frames read.
+    """Point shell for frames: runs of points, with bounding spheres.
 
-    points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
-    spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
-    groups (G + B, 4): the same of each group of `GROUP` runs, and behind them of each block if
-    there are `BLOCK` runs or more; columns (3, N): the points again, one row for each axis; scratch
-    (SCRATCH_ROWS, run): memory for one placed run. Each thread needs its own scratch.
+    points (N, 6) : metres and inward normals, tool frame, in the order of the shell; center (3,);
+    spheres (C, 4) : centre and radius, metres, of each run of `run` points, or (0, 4) for none;
+    groups (G + B, 4) : the same of each group of `GROUP` runs, then of each block if there are
+    `BLOCK` runs; columns (3, N) : the points again, a row for each axis; scratch (SCRATCH_ROWS,
+    run) : memory for one placed run, separate for each thread.
     """
 
     points: Floats
@@ -156,7 +154,7 @@ CLUSTERS = fields_of(Clusters, FLOATS2, FLOATS, FLOATS2, FLOATS2, INT, FLOATS2, 
 
 @leaf
 def n_runs_of(shell):
-    """Number of a shell's runs."""
+    """Number of a shell's runs; the last may be shorter."""
     return (shell.points.shape[0] + shell.run - 1) // shell.run
 
 
@@ -168,16 +166,16 @@ def key_of_cell(ci, cj, ck):
 
 @leaf
 def cell_key(i, j, k):
-    """Key of the cell that holds voxel (i, j, k)."""
+    """Directory key of the cell of voxel (i, j, k)."""
     return key_of_cell(i >> 5, j >> 5, k >> 5)
 
 
 @inlined
 def cells_of_box(x, y, z, reach, side):
-    """First and last cell on each axis, i, j, k, of the part of a cube that is in the grid.
+    """First and last cell on each axis, i, j, k, of a cube's part in the grid.
 
-    (x, y, z), reach: the cube's centre and half its side, voxels. However far it is from the grid,
-    no first cell is beyond it: no integer holds the largest coordinates.
+    (x, y, z), reach : the cube's centre and half its side, voxels. First coordinates are clamped to
+    the grid before they become integers: the largest floats exceed int64.
     """
     top = side - 1.0
     return (
@@ -189,39 +187,39 @@ def cells_of_box(x, y, z, reach, side):
 
 @inlined
 def in_voxels(transform, place, x, y, z):
-    """A point of the tool, metres, placed by a pose, in voxels from the grid's origin."""
+    """Point of the tool, metres, transformed by a pose, in voxels from the grid's origin."""
     x, y, z = moved(transform, x, y, z)
     return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
 
 
 @leaf
 def column_of(i, j):
-    """Index of the word that holds voxel (i, j, k) in its cell, for any k."""
+    """Index in its cell of the word with voxel (i, j, k), for any k."""
     return ((i & 31) << 5) | (j & 31)
 
 
 @leaf
 def bit_in(word, k):
-    """Bit of voxel (i, j, k) in its word: 1 where the voxel is occupied."""
+    """Bit of voxel (i, j, k) in its word, 0 or 1."""
     return (word >> np.uint32(k & 31)) & 1
 
 
 @leaf
 def brick_bit(i, j, k):
-    """Which bit of its cell's mask stands for the brick that holds voxel (i, j, k)."""
+    """Bit number, in its cell's mask, of the brick with voxel (i, j, k)."""
     return np.uint64((((i >> 3) & 3) << 4) | (((j >> 3) & 3) << 2) | ((k >> 3) & 3))
 
 
 @leaf
 def spread_key(key, capacity):
-    """Place at which the search for a key begins in a table of that capacity, a power of two."""
+    """First index of a key's probe sequence in a table of that capacity, a power of two."""
     # Fibonacci hashing (Knuth, volume 3, section 6.4); the fold mixes the upper axis in
     return (((key ^ (key >> 29)) * 0x9E3779B97F4A7C1) >> 20) & (capacity - 1)
 
 
 @inlined
 def place_in_set(found, key):
-    """Index of a key in found (capacity,), an open-addressing set; where it goes if it is new."""
+    """Index of a key in found (capacity,), an open-addressing set; the free index for a new key."""
     capacity = found.shape[0]
     at = spread_key(key, capacity)
     while found[at] >= 0 and found[at] != key:
@@ -243,13 +241,13 @@ def slot_of(keys, slots, which, key):
 
 @inlined
 def seen_in(cells, which, words):
-    """Words of voxels as a frame sees them in directory `which`; for leaves, not for entries."""
+    """Words of voxels for a frame in directory `which`; for leaves, not for entries."""
     return Seen(cells.keys, cells.slots, words, cells.masks, cells.used, which)
 
 
 @leaf
 def begin_frame(cells, reader):
-    """Announce a frame of a reader; returns the directory that the frame reads to its end."""
+    """Announce a frame of a reader; return its directory, valid until `end_frame`."""
     control, readers = cells.control, cells.readers
     while True:
         version = control[VERSION]
@@ -270,7 +268,7 @@ def end_frame(cells, reader):
 
 @inlined
 def with_missed(missed, count, key):
-    """Add an unknown cell to the list, if absent and there is room -> cells on the list."""
+    """Add an unknown cell to the list, unless present or the list is full; return its length."""
     for n in range(1, count + 1):
         if missed[n] == key:
             return count
@@ -282,9 +280,9 @@ def with_missed(missed, count, key):
 
 @inlined
 def enter_cell(seen, key, missed, n_missed):
-    """Look a cell up -> its slot, its mask, and the number of unknown cells on the list `missed`.
+    """Slot and mask of a cell, and the length of the list `missed` of unknown cells.
 
-    The mask of a cell that is empty or unknown is zero.
+    The slot is marked as used. The mask of an empty or unknown cell is zero.
     """
     slot = slot_of(seen.keys, seen.slots, seen.which, key)
     mask = np.uint64(0)

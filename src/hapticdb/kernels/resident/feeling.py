@@ -1,11 +1,11 @@
-"""Frames over resident cells: what a placed shell feels, without a database.
+"""Frames over resident cells: contacts and wrench of a placed shell, without a database.
 
-A run of points goes through short loops, one after another: the points that may count move to the
-front of the scratch, then come normals, depths and sums. In one long loop a processor has room for
-hardly more than one point at a time, waits for each look-up, and takes 1.6 times as long. Where a
-run meets few cells, all of them known, no loop branches. The sums run in the order of the points,
-and a point that does not push adds zero, so the results are those of the frames on rows, bit for
-bit. What differs between laws: `felt_where` and `_weigh`.
+A run of points passes through short loops, one after another: the points in range move to the front
+of the scratch, then come normals, depths and sums. In one long loop a processor has room for hardly
+more than one point at a time, waits for each look-up, and takes 1.6 times as long. For a run in few
+cells, none of them unknown, no loop branches. The sums run in the order of the points, and a point
+without a force adds zero, so the results are those of the frames on rows, bit for bit. Only
+`felt_where` and `_weigh` differ between laws.
 """
 
 from typing import Any
@@ -79,17 +79,17 @@ from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 
 def _in_near_voxels(law, words, near):  # noqa: ARG001 - the arguments of each choice
-    """Where the distance law may feel a point."""
+    """`felt_where` of the distance law."""
     return near, 0.0, np.int64(0)
 
 
 def _in_voxels_alone(law, words, near):  # noqa: ARG001 - likewise
-    """Where the tangent-plane law may feel a point."""
+    """`felt_where` of the tangent-plane law."""
     return words, 0.0, np.int64(0)
 
 
 def _around_voxels(law, words, near):  # noqa: ARG001 - likewise
-    """Where a law may feel a point of which only its margin is known."""
+    """`felt_where` of a law with a margin alone."""
     return words, felt_within(law), np.int64(1)
 
 
@@ -97,13 +97,13 @@ def _around_voxels(law, words, near):  # noqa: ARG001 - likewise
 def _near_of_run(
     anyway, seen, words, start, count, side, scratch, met, missed, n_hits, n_missed, last
 ):
-    """Move the points of a placed run that may count to the front of `scratch`.
+    """Move the points of a placed run in range of the law to the front of `scratch`.
 
-    Every point in a known brick is written there, and the next one over it if it does not count: a
-    mispredicted branch costs more. anyway: 1 if a point counts whatever its voxel; last: key, slot,
-    mask and base of the cell of the last point. Returns the numbers of such points, of hits and of
-    cells on the list `missed` so far, and of points in unknown cells, and then the cell of the last
-    point.
+    Every point in a marked brick is written there, and overwritten by the next one if out of range:
+    a mispredicted branch costs more. anyway : 1 to include points of any voxel in a marked brick;
+    last : key, slot, mask and base of the last point's cell. Returns the numbers of points in
+    range, of hits and of cells on the list `missed` so far, and of points in unknown cells, then
+    the last point's cell.
     """
     last_key, slot, mask, base = last
     n_near = n_unknown = np.int64(0)
@@ -140,7 +140,7 @@ def _near_of_run(
 def _near_in_cells(words, felt, start, count, box, scratch, met, n_hits):
     """`_near_of_run` for a run in the cells of `runs.cells_of_run`: without a branch.
 
-    Returns the numbers of points that may count and of hits. What a bit is set for is in a brick.
+    Returns the numbers of points in range and of hits. Set bits are in marked bricks alone.
     """
     words_of_run(count, box, start, scratch)
     n_near = np.int64(0)
@@ -158,7 +158,7 @@ def _near_in_cells(words, felt, start, count, box, scratch, met, n_hits):
 
 @inlined
 def _turn_normals(points, transform, scratch, count):
-    """Turned normals of the first points of `scratch`."""
+    """Rotated normals of the first points of `scratch`."""
     for at in range(count):
         n = np.int64(scratch.number[at])
         nx, ny, nz = turned(transform, points[n, 3], points[n, 4], points[n, 5])
@@ -167,7 +167,7 @@ def _turn_normals(points, transform, scratch, count):
 
 @inlined
 def _find_places(scratch, count, ahead):
-    """Where to look up the first points of `scratch`, moved `ahead` voxels along their normals."""
+    """Interpolation index and fractions of the first points, `ahead` voxels along the normals."""
     for at in range(count):
         x = scratch.x[at] + ahead * scratch.nx[at]
         y = scratch.y[at] + ahead * scratch.ny[at]
@@ -181,7 +181,7 @@ def _find_places(scratch, count, ahead):
 
 @inlined
 def _look_up(payload, scratch, count, out):
-    """Distances u, voxels, at the places of the first points of `scratch`, into a row of it."""
+    """Distances u, voxels, interpolated for the first points of `scratch`, into a row of it."""
     for at in range(count):
         out[at] = VOXELS_A_STEP * interpolated(
             payload, np.uint64(np.int64(scratch.look_up[at])), scratch.part_x[at],
@@ -192,8 +192,8 @@ def _look_up(payload, scratch, count, out):
 def _weigh_by_distance(law, cells, points, transform, place, scratch, count):  # noqa: ARG001
     """`_weigh` under the distance law.
 
-    Distances are fetched into the cache while the normals are turned. This takes a seventh off a
-    frame of 100,000 contacts.
+    The distances are prefetched into the cache while the normals are rotated: a seventh off a frame
+    of 100,000 contacts.
     """
     payload = cells.payload
     for at in range(count):
@@ -214,7 +214,7 @@ def _weigh_by_distance(law, cells, points, transform, place, scratch, count):  #
 
 @inlined
 def _center_on_axis(origin, size, x):
-    """Centre of the voxel of a place x, voxels, as `contact.center_of` has it, metres."""
+    """Coordinate of the voxel's centre at x, voxels, in metres, as in `contact.center_of`."""
     return origin + size * (np.floor(x) + 0.5)
 
 
@@ -262,18 +262,18 @@ OF_LAWS: dict[type, Any] = {
 }
 OF_OTHERS = _around_voxels, _weigh_by_leaves
 felt_where = chosen_by_type(lambda law: OF_LAWS.get(law, OF_OTHERS)[0])
-"""Where a law may feel a point: words of voxels; voxels around them; 1 if also beside those."""
+"""Range of a law: words of voxels; voxels around them; 1 to include points outside these, too."""
 _weigh = chosen_by_type(lambda law: OF_LAWS.get(law, OF_OTHERS)[1])
-"""Turned normal, depth (at least 0) and weight of the first points of the scratch."""
+"""Rotated normal, depth (at least 0) and weight of the first points of the scratch."""
 
 
 @leaf
 def felt(law, cells, which, shell, pose, place, met, missed, out):
-    """One frame: hits of a placed shell and the wrench of the points felt, into out (RESULTS,).
+    """One frame: hits of a placed shell and the wrench of its contacts, into out (RESULTS,).
 
-    met (N,) takes the indices of the hits; missed (1 + MOST_MISSED,) takes the number and the keys
-    of the unknown cells that hold points. A point in an unknown cell is neither a hit nor a miss.
-    Arithmetic and order of the sums are those of `contact.locate` and `refining.refine`.
+    met (N,) : indices of the hits; missed (1 + MOST_MISSED,) : number and keys of the unknown cells
+    with points. A point in an unknown cell is neither a hit nor a miss. Arithmetic and order of the
+    sums are those of `contact.locate` and `refining.refine`.
     """
     points, scratch, words, n_runs = shell.points, scratch_of(shell), cells.words, n_runs_of(shell)
     felt_in, margin, anyway = felt_where(law, words, cells.near)
@@ -325,7 +325,7 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
     also={CELLS: CELLS_WITH_DISTANCES, TANGENT_PLANE: DISTANCE_FIELD},
 )  # fmt: skip
 def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
-    """`felt` at poses (M, 4, 4) into out (M, RESULTS); met, missed: of the last frame.
+    """`felt` at poses (M, 4, 4) into out (M, RESULTS); `met`, `missed` : of the last frame.
 
     Returns the number of poses done: fewer than M when one is not rigid.
     """

@@ -1,4 +1,4 @@
-"""Whether a shell hits anything at poses in no order: the search of a pose ends at one hit."""
+"""Collision queries of a shell at poses in any order: a pose ends at its first hit."""
 
 import numpy as np
 
@@ -21,13 +21,12 @@ from hapticdb.kernels.resident.runs import next_run, place_run, scratch_of
 from hapticdb.kernels.rigid import transform_of
 
 NOTHING, UNDECIDED = -1, -2
-"""In the place of a point: no point hits; no point hits in a cell that is resident, and one lies in
-a cell that is not."""
+"""Instead of a point: no hit; no hit in a resident cell, and a point in an unknown one."""
 
 
 @inlined
 def _hit_in_run(seen, shell, scratch, run, transform, place):
-    """A point of a run that is in an occupied voxel, NOTHING or UNDECIDED."""
+    """Point of a run in an occupied voxel, NOTHING or UNDECIDED."""
     side, hit = place.side, np.int64(NOTHING)
     start, count = place_run(shell, run, transform, place, scratch)
     for at in range(count):
@@ -45,7 +44,7 @@ def _hit_in_run(seen, shell, scratch, run, transform, place):
 
 @inlined
 def _first_hit(seen, shell, transform, place, begin):
-    """A point that hits, NOTHING or UNDECIDED; the search begins at run `begin`."""
+    """Point of a shell in an occupied voxel, NOTHING or UNDECIDED; starts at run `begin`."""
     scratch, hit = scratch_of(shell), np.int64(NOTHING)
     for turn in range(2):  # from there to the end, then the runs before
         run, end = (begin, n_runs_of(shell)) if turn == 0 else (np.int64(0), begin)
@@ -63,14 +62,14 @@ def _first_hit(seen, shell, transform, place, begin):
 
 @entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, INTS)
 def find_first_hits(cells, reader, shell, poses, place, found):
-    """A point that is in an occupied voxel at each of poses (B, 4, 4), into found (B,) int64.
+    """A point in an occupied voxel at each of poses (B, 4, 4), into found (B,) int64.
 
-    It is NOTHING or UNDECIDED where there is none. The search begins at the points that hit last,
-    so neighbouring poses should follow one another. Hits are those of `feeling.felt`.
+    It is NOTHING or UNDECIDED without one. The search begins at the group of the last hit, so
+    neighbouring poses should follow one another. Hits are those of `feeling.felt`.
     """
     begin = np.int64(0)
     which = begin_frame(cells, reader)
-    # made here: references to what a leaf returns are not counted
+    # made here: references to a leaf's result are not counted
     seen = Seen(cells.keys, cells.slots, cells.words, cells.masks, cells.used, which)
     for n in range(poses.shape[0]):
         found[n] = _first_hit(seen, shell, transform_of(poses[n]), place, begin)

@@ -1,14 +1,14 @@
-"""Near voxels: those in which a point may count under the distance law.
+"""Near voxels: the voxels in range of the distance law.
 
 A voxel is near if a lower bound of the distances in it is at most the law's reach. The bound comes
-from the same stored distances that a frame interpolates, so no point that counts is missed.
+from the stored distances of a frame's interpolation, so no point in range is missed.
 
-Proof. In a voxel, the interpolated distance takes its least value at one of 27 places: the voxel's
-centre and the middles of its faces, edges and corners, between which it is trilinear. On one axis
-these are the centre, with the value c, and the two borders, with the means of c and a neighbour.
-The least of the three is (c + min(before, c, after)) / 2. To take this least value along k, then of
-the results along j, then along i, gives a lower bound of all 27: a mean of least values is never
-above the least mean. The bound is exact where the distances fall along each axis in one direction.
+Proof. In a voxel, the interpolated distance takes its least value at one of 27 points: the voxel's
+centre, its corners and the middles of its faces and edges; it is trilinear between them. On one
+axis these are the centre, with the value c, and the two borders, with the means of c and a
+neighbour. The least of the three is (c + min(before, c, after)) / 2. This least value along k, then
+of the results along j, then along i, is a lower bound of all 27: a mean of least values is never
+above the least mean. The bound is exact for distances falling along each axis in one direction.
 """
 
 import numpy as np
@@ -30,8 +30,8 @@ def mark_near_voxels(places, payload, masks, words, near):
     """Write the near voxels of cells in slots places (n,) from their distances and their voxels.
 
     payload (S, 34^3) uint8; masks (S,) uint64; words, near (S, 1024) uint32. Occupied voxels count
-    as near. A brick whose bit of the mask is 0 has none, since a frame on rows finds no row there.
-    The loops along k are plain, so that the compiler vectorizes them.
+    as near. A brick with a mask bit of 0 has none, since a frame on rows finds no row there. The
+    loops along k are plain, for vectorization.
     """
     along_k = np.empty((CELL_SIDE * CELL_SIDE, SIDE), dtype=np.int16)
     along_j = np.empty((CELL_SIDE * SIDE, SIDE), dtype=np.int16)

@@ -1,11 +1,10 @@
-"""Distance of a shell from occupied voxels at poses that have nothing to do with one another.
+"""Distance of a shell from occupied voxels at unrelated poses.
 
-Balls of points are looked around before their points: groups of runs, then runs. What was found
-around a place is remembered for its cube of space (`records.NEAR_CUBE`), and bounds the distance of
-every place in that cube. So most balls and points are left out without a search, at this pose and
-at later ones.
+Bounding spheres (balls) are searched before their points: groups of runs, then runs. The result
+around a point is cached for its cube of space (`records.NEAR_CUBE`), and bounds the distance of
+every point in this cube. So most balls and points need no search, at this pose and at later ones.
 
-The search of a pose stops at the first cell that is not resident, and says at which point. The
+The search of a pose stops at the first unknown cell, and returns the point it has reached. The
 caller fetches cells there and continues the search; no distance is guessed.
 """
 
@@ -39,41 +38,41 @@ AXIS_MASK = (1 << AXIS_BITS) - 1
 
 
 CAUTION = 1e-6
-"""Voxels by which a bound is lowered, so that rounding errors cannot make it wrong."""
+"""Margin of bounds for rounding errors, voxels."""
 POINT, RUN, GROUPED = 0, 1, 2
-"""What is looked around at once: a point, a run of points, a group of runs."""
+"""Unit of a search: a point, a run of points, a group of runs."""
 CUBE_OF_BALL = 2
-"""Binary logarithm of the edge, voxels, of the cubes that balls are in. A larger cube is met again
-more often, and bounds the distance less closely."""
+"""Binary logarithm of the edge, voxels, of the balls' cubes. Larger: more hits in the cache, and
+looser bounds of the distance."""
 SURVEY, NEAREST_BALL, ALL = 0, 1, 2
-"""Turns of a pose's search: bounds of all balls, the points of the ball that may be nearest, and
-all that may be nearer than these."""
+"""Passes of a pose's search: bounds of all balls, the points of the ball with the least bound, and
+all balls and points possibly nearer than these."""
 
 
 NOT_KNOWN = np.zeros((), NEAR_CUBE)
-"""A cube of which nothing is known. What is known holds for one revision, and each thread needs
-cubes of its own: an array (F,) of such records, F a power of two, in which one replaces another."""
+"""Empty entry of the cache of cubes: an array (F,) of such records, F a power of two,
+direct-mapped. A cache is valid for one revision and one thread."""
 NOT_KNOWN["key"] = NOT_KNOWN["nearest"] = -1
 NOT_KNOWN["bound"] = -1.0
 
 
 @leaf
 def packed(i, j, k):
-    """Voxel (i, j, k) as one number."""
+    """Voxel (i, j, k) as one integer."""
     return (i << (2 * AXIS_BITS)) | (j << AXIS_BITS) | k
 
 
 @leaf
 def unpacked(voxel):
-    """Voxel (i, j, k) of a number; undoes `packed`."""
+    """Voxel (i, j, k) of an integer; inverse of `packed`."""
     return voxel >> (2 * AXIS_BITS), (voxel >> AXIS_BITS) & AXIS_MASK, voxel & AXIS_MASK
 
 
 @leaf
 def _window_of(x, radius, first):
-    """First and last voxel, 0 to 31, of a cell from `first` on whose gap to x may be below radius.
+    """First and last voxel, 0 to 31, of a cell from `first` on, possibly within `radius` of x.
 
-    Voxels of a cell that lies wholly on one side of x give its border voxel.
+    For a cell wholly on one side of x, its border voxel.
     """
     low = np.int64(min(max(math.floor(x - radius) - first, 0), 31))
     high = np.int64(min(max(math.floor(x + radius) - first, 0), 31))
@@ -82,17 +81,17 @@ def _window_of(x, radius, first):
 
 @inlined
 def _nearest_in_cell(seen, slot, ci, cj, ck, x, y, z, square, voxel):
-    """Least squared distance from (x, y, z) to a voxel of one cell, and that voxel, packed.
+    """Least squared distance from (x, y, z) to a voxel of one cell, and this voxel, packed.
 
     Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels. Only columns
-    within the radius are looked at, so the loops hardly branch: a fifth off a search.
+    within the radius are read, so the loops hardly branch: a fifth off a search.
     """
     radius, words, mask = math.sqrt(square), seen.words, seen.masks[slot]
     i0, j0, k0 = ci << 5, cj << 5, ck << 5
     first_i, last_i = _window_of(x, radius, i0)
     first_j, last_j = _window_of(y, radius, j0)
     low, high = _window_of(z, radius, k0)
-    # columns begin at the place's own height
+    # columns are searched up and down from the point's own height
     middle = np.int64(min(max(math.floor(z) - k0, 0), 31))
     window = (np.int64(2) << high) - (np.int64(1) << low)
     for bi in range(first_i >> 3, (last_i >> 3) + 1):
@@ -104,7 +103,7 @@ def _nearest_in_cell(seen, slot, ci, cj, ck, x, y, z, square, voxel):
             dj = gap(y, j0 + 8.0 * bj, j0 + 8.0 * bj + 8.0)
             if not bricks or di * di + dj * dj >= square:
                 continue
-            height, kept = np.inf, np.int64(0)  # squared gap to the bricks that may be near
+            height, kept = np.inf, np.int64(0)  # squared gap to the bricks possibly near
             for bk in range(low >> 3, (high >> 3) + 1):
                 if (bricks >> bk) & 1:
                     dk = gap(z, k0 + (bk << 3), k0 + (bk << 3) + 8.0)
@@ -152,7 +151,7 @@ def square_to(x, y, z, voxel):
 def nearest_voxel(seen, x, y, z, square, voxel, side):
     """Occupied voxel nearest to (x, y, z), all in voxels, if nearer than the root of `square`.
 
-    Returns its box's squared distance and the voxel, packed, or both as given; voxel -2 when a cell
+    Returns its box's squared distance and the voxel, packed, or both as given; voxel -2 if a cell
     in reach is not resident.
     """
     box = cells_of_box(x, y, z, math.sqrt(square), side)
@@ -177,10 +176,10 @@ def nearest_voxel(seen, x, y, z, square, voxel, side):
 
 @leaf
 def room_around(seen, x, y, z, half, most, side):
-    """How far a cube may grow on each side before it meets an occupied brick or an unknown cell.
+    """Voxels a cube may grow on each side before it reaches a marked brick or an unknown cell.
 
-    (x, y, z), half: the cube's centre and half its side, voxels. The result is at most `most`, and
-    not above zero if the cube meets one already.
+    (x, y, z), half : the cube's centre and half its side, voxels. The result is at most `most`, and
+    not above zero if the cube reaches one already.
     """
     least = half + most
     first_i, last_i, first_j, last_j, first_k, last_k = cells_of_box(x, y, z, least, side)
@@ -211,9 +210,9 @@ def room_around(seen, x, y, z, half, most, side):
 
 @leaf
 def _nearest_brick(mask, i, j, k, x, y, z, least):
-    """Distance on the axis where it is largest, from (x, y, z) to the nearest brick of a cell.
+    """Chebyshev distance from (x, y, z) to the nearest marked brick of a cell, at most `least`.
 
-    mask: of the cell, whose lowest corner is (i, j, k); all in voxels. `least` if none is nearer.
+    mask : of the cell with lowest corner (i, j, k); all in voxels.
     """
     for bi in range(4):
         if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
@@ -234,10 +233,9 @@ def _nearest_brick(mask, i, j, k, x, y, z, least):
 
 @inlined
 def _level_at(spheres, groups, run, point, largest):
-    """What the search looks around next, where it has come to a point.
+    """Unit of the next search at a point: GROUPED, RUN or POINT.
 
-    It is the largest of GROUPED, RUN and POINT that begins there and has a radius of `largest` m or
-    less.
+    It is the largest unit with its first point there and a radius of `largest` m or less.
     """
     if spheres.shape[0] == 0 or point % run != 0 or point // run >= spheres.shape[0]:
         return POINT
@@ -248,7 +246,7 @@ def _level_at(spheres, groups, run, point, largest):
 
 @inlined
 def _ball_at(points, spheres, groups, run, point, level):
-    """Centre and radius, tool frame, metres, of what is looked around, and its number of points."""
+    """Centre and radius, tool frame, metres, of the unit at a point, and its number of points."""
     if level == POINT:
         return points[point, 0], points[point, 1], points[point, 2], 0.0, np.int64(1)
     if level == RUN:
@@ -260,7 +258,7 @@ def _ball_at(points, spheres, groups, run, point, level):
 
 @leaf
 def _bounded_by(x, y, z, square, voxel):
-    """Squared distance to a voxel, or -1, with which a search begins: the voxel if it is nearer."""
+    """Start of a search: squared distance and `voxel` if nearer, else `square` and -1."""
     if voxel >= 0 and square_to(x, y, z, voxel) < square:
         return square_to(x, y, z, voxel), voxel
     return square, np.int64(-1)
@@ -270,9 +268,10 @@ def _bounded_by(x, y, z, square, voxel):
 def bound_at(cubes, seen, x, y, z, wanted, near, shift, side):
     """Lower bound of the distance from (x, y, z) to an occupied voxel, and a voxel near it or -1.
 
-    All in voxels. Looks the place's cube up, or searches around its middle as far as decides
-    whether a voxel is nearer than `wanted` to any place in it. near: an occupied voxel with which a
-    search begins, or -1. The bound is 0 outside the grid, and where a cell is not resident.
+    All in voxels. Reads the cache for the point's cube, or searches around the cube's middle, just
+    far enough to detect any voxel nearer than `wanted` to a point of the cube. near : occupied
+    voxel as the start of a search, or -1; shift : binary logarithm of the cube's edge. The bound is
+    0 outside the grid, and if a cell is not resident.
     """
     if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
         return 0.0, np.int64(-1)
@@ -296,7 +295,7 @@ def bound_at(cubes, seen, x, y, z, wanted, near, shift, side):
 
 @leaf
 def promised(x, y, z, voxel):
-    """Distance to a known voxel at most, for which -1 promises nothing."""
+    """Upper bound of the distance from (x, y, z) by an occupied voxel; infinite for -1."""
     return math.sqrt(square_to(x, y, z, voxel)) + CAUTION if voxel >= 0 else np.inf
 
 
@@ -306,24 +305,24 @@ def promised(x, y, z, voxel):
 def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squares, nearest, done):
     """Least squared distance from the points to an occupied voxel's box at each of poses (B, 4, 4).
 
-    largest: metres; a larger run is not looked around as a whole. fine: binary logarithm of the
-    edge, voxels, of the cubes that points are in, at most `CUBE_OF_BALL`. squares (B,): the
-    greatest distance to search before, the least after, squared, voxels; nearest (B,): the point,
-    or -1 while nothing is nearer; done (B,): points searched. With fewer than N a pose has met a
-    cell that is not resident, and a later call continues there.
+    largest : greatest radius, m, of a run or group searched as a whole. fine : binary logarithm of
+    the edge, voxels, of the points' cubes, at most `CUBE_OF_BALL`. squares (B,) : greatest distance
+    to search before, least after, squared, voxels; nearest (B,) : the point, or -1 while nothing is
+    nearer; done (B,) : points searched. Fewer than N: a cell at the pose is not resident, and a
+    later call continues there.
     """
     points, _, spheres, groups, run, _, _ = shell
     size, side, total = place.size, place.side, points.shape[0]
     seed = hot = near = np.int64(-1)
     which = begin_frame(cells, reader)
-    # made here: references to what a leaf returns are not counted
+    # made here: references to a leaf's result are not counted
     seen = Seen(cells.keys, cells.slots, cells.words, cells.masks, cells.used, which)
     for n in range(poses.shape[0]):
         if done[n] >= total:
             continue
         transform = transform_of(poses[n])
         square, best = squares[n], nearest[n]
-        if seed >= 0 and hot >= 0:  # the voxel that was nearest at the pose before
+        if seed >= 0 and hot >= 0:  # the nearest voxel at the pose before
             point = in_voxels(transform, place, points[hot, 0], points[hot, 1], points[hot, 2])
             bound = square_to(point[0], point[1], point[2], seed)
             square, best = (bound, hot) if bound < square else (square, best)

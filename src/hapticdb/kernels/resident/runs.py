@@ -1,4 +1,4 @@
-"""Runs of a shell's points: which runs are far from everything, and where the others lie."""
+"""Runs of a shell's points: culling by bounding spheres, and cells of the other runs."""
 
 from typing import NamedTuple
 
@@ -21,29 +21,29 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.rigid import moved
 
 MOST_COLUMNS = 64
-"""Most columns (i, j) of a box that are read. In a larger box an occupied brick counts as near."""
+"""Most columns (i, j) read in a box. In a larger box an occupied brick counts as near."""
 MOST_CELLS = 8
-"""Most cells of a box that are read. A larger box counts as near, and its points are looked up."""
+"""Most cells read in a box. A larger box counts as near, and its points are looked up."""
 
 
 WORD_BITS = 10
 """Binary logarithm of `CELL_WORDS`."""
 FURTHEST = float(1 << 22)
-"""Voxels: beyond every grid, and within 32 bits."""
+"""Coordinate beyond every grid and within 32 bits, voxels."""
 
 
 class Scratch(NamedTuple):
-    """A placed run of a shell: rows of `Clusters.scratch`, each with a number for each point.
+    """Placed run of a shell: rows of `Clusters.scratch`, each with a number for each point.
 
-    px, py, pz: metres; x, y, z: voxels; nx, ny, nz: turned normal; number: the point's; base: where
-    the distances of its cell begin, less the way to the cell's first centre; word, bit: the word
-    that holds its voxel, of all words of the table, and the bit; kept: the points that are kept;
-    look_up: index of the lowest corner around a place; part_x, part_y, part_z: the place between
-    the corners; here, there: distance at the point and ahead of it, voxels; depth, m; weight.
-    slot_of, base_of: of the cells that the run meets.
+    px, py, pz : metres. x, y, z : voxels. nx, ny, nz : rotated normal. number : index of the point.
+    base : start of its cell's distances, less the offset of the cell's first centre. word, bit : of
+    its voxel, in the words of the whole table. kept : indices for `keep_points`. look_up : index of
+    the lowest corner of an interpolation. part_x, part_y, part_z : fractions between its corners.
+    here, there : distance at the point and ahead of it, voxels. depth : m. weight. slot_of,
+    base_of : of the run's cells.
 
-    Rows are arrays of their own, and no records of points, so that the compiler vectorizes loops
-    over points. Indices are whole numbers below 2^53, which a float has exactly.
+    Rows are separate arrays, not records of points, so the compiler vectorizes loops over points.
+    Indices are integers below 2^53, exact in a float.
     """
 
     px: Floats
@@ -74,7 +74,7 @@ class Scratch(NamedTuple):
 
 @inlined
 def scratch_of(shell):
-    """Rows of a shell's scratch; for leaves, not for entries."""
+    """Named rows of a shell's scratch; for leaves, not for entries."""
     r = shell.scratch
     return Scratch(
         r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11],
@@ -83,7 +83,7 @@ def scratch_of(shell):
 
 
 def _masks_of_runs(stride: int) -> NDArray[np.uint64]:
-    """Masks (4, 4): entry [low, high] has the bricks low .. high on the axis of that stride."""
+    """Masks (4, 4): entry [low, high] has the bricks low .. high, with bits `stride` apart."""
     masks = np.zeros((4, 4), dtype=np.uint64)
     for low in range(4):
         for high in range(low, 4):
@@ -101,10 +101,10 @@ _COLUMNS = np.array(
 
 @inlined
 def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
-    """Whether a closed box in the grid holds a seen voxel, or may: unknown cells count, too.
+    """Whether a closed box in the grid may contain a voxel of `seen`; unknown cells count, too.
 
     The masks of bricks are read first, then, in a small box, the words. The loop over words has no
-    early end, since a mispredicted branch costs more than ten words.
+    early exit, since a mispredicted branch costs more than ten words.
     """
     keys, slots, words, masks, used, which = seen
     is_near = False
@@ -142,7 +142,7 @@ def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
 
 @inlined
 def is_sphere_free(seen, spheres, n, transform, place, reached):
-    """Whether no voxel is in the box around sphere n of a placed shell, wider by `reached` voxels.
+    """Whether no voxel is in the AABB of sphere n of a placed shell, enlarged by `reached` voxels.
 
     Unknown cells count as occupied; space outside the grid is free.
     """
@@ -166,7 +166,7 @@ def is_sphere_free(seen, spheres, n, transform, place, reached):
 
 @inlined
 def is_block_free(seen, spheres, groups, cluster, transform, place, reached):
-    """Whether run `cluster` is the first of a block that is far from all voxels."""
+    """Whether run `cluster` is the first of a block far from all voxels."""
     n_runs = spheres.shape[0]
     return (
         n_runs >= BLOCK
@@ -184,10 +184,9 @@ def is_block_free(seen, spheres, groups, cluster, transform, place, reached):
 
 @inlined
 def _free_runs(seen, shell, run, transform, place, reached):
-    """Number of runs, from `run` on, that are far from all voxels: BLOCK, GROUP, 1 or 0.
+    """Number of runs, from `run` on, farther than `reached` voxels from all: BLOCK, GROUP, 1 or 0.
 
-    Far means farther away than `reached` voxels. A shell without spheres says in `groups` what to
-    skip (`budget.Budget.skips`), or has no groups: then it is 0.
+    A shell without spheres lists in `groups` the runs to skip, or has no groups: then it is 0.
     """
     spheres, groups = shell.spheres, shell.groups
     if spheres.shape[0] == 0:
@@ -201,9 +200,9 @@ def _free_runs(seen, shell, run, transform, place, reached):
 
 @inlined
 def next_run(seen, shell, run, end, transform, place, reached):
-    """First run, from `run` on and before `end`, that may be near a voxel; `end` or more: none is.
+    """First run, from `run` on and before `end`, possibly near a voxel; `end` or more without one.
 
-    All frames and searches walk a shell by it, forwards.
+    All frames and searches traverse a shell by it, forwards.
     """
     while run < end:
         n_free = _free_runs(seen, shell, run, transform, place, reached)
@@ -217,8 +216,8 @@ def next_run(seen, shell, run, end, transform, place, reached):
 def place_run(shell, run, transform, place, scratch):
     """Place the points of a run: scratch takes metres and voxels.
 
-    Returns the first point and their number. One loop for each axis, which the compiler vectorizes:
-    this halves the time of a flat frame of 100,000 points.
+    Returns the first point and their number. One loop for each axis, for vectorization: this halves
+    the time of a flat frame of 100,000 points.
     """
     ox, oy, oz, size, columns = place.x, place.y, place.z, place.size, shell.columns
     start = run * shell.run
@@ -238,20 +237,20 @@ def place_run(shell, run, transform, place, scratch):
 
 @inlined
 def _voxel_on_axis(x):
-    """Voxel of a coordinate, 32 bits, so that the compiler converts several at once."""
+    """Voxel of a coordinate as int32, so the compiler converts several at once."""
     return np.int32(min(max(np.floor(x), -1.0), FURTHEST))
 
 
 @inlined
 def cells_of_run(seen, count, side, scratch):
-    """Slots of the cells that a placed run meets, into the scratch -> cells, and where they begin.
+    """Slots of a placed run's cells into `scratch`; return the box of these cells.
 
-    The cells are those of the box around the run's voxels, k fastest, then j; `base_of` takes where
-    the distances of each begin, less the way to the cell's first centre. Returns their number, the
-    numbers along j and k, and the first cell. The number is 0 if none holds anything, and below 0
-    if the run must be looked up point by point: a part of it is outside the grid or in a cell that
-    is unknown, or it meets more than `MOST_CELLS`. The loop over points is plain, so that the
-    compiler vectorizes it.
+    The box is that of the run's voxels, with k fastest, then j; `base_of` takes the start of each
+    cell's distances, less the offset of the cell's first centre. Returns the number of cells, the
+    numbers along j and k, and the first cell. The number is 0 if all bricks are unmarked, and below
+    0 for a look-up point by point: a part of the run is outside the grid or in an unknown cell, or
+    there are more cells than points or `MOST_CELLS`. The loop over points is plain, for
+    vectorization.
     """
     i0 = i1 = _voxel_on_axis(scratch.x[0])
     j0 = j1 = _voxel_on_axis(scratch.y[0])
@@ -286,11 +285,11 @@ def cells_of_run(seen, count, side, scratch):
 
 @inlined
 def words_of_run(count, box, start, scratch):
-    """Enter number, base, word and bit of a run in the cells that `cells_of_run` found.
+    """Number, base, word and bit of a run's points, in the cells of `cells_of_run`.
 
-    All numbers are whole and below 2^53, so floats have them exactly, and the compiler vectorizes
-    the loops: it cannot do so with integers of 64 bits. Runs in a single cell, more than half of
-    them, look up no cell for each point.
+    All are integers below 2^53, exact in floats, so the compiler vectorizes the loops: it cannot
+    with integers of 64 bits. Runs in a single cell, more than half of them, need no cell of a
+    point.
     """
     n_cells, n_j, n_k, ci, cj, ck = box
     for at in range(count):
@@ -318,7 +317,7 @@ def words_of_run(count, box, start, scratch):
 
 @inlined
 def keep_points(scratch, count, n_kept):
-    """Move the points of a run that are listed as kept to the front, if not all of them are."""
+    """Move the points listed in `kept` to the front, unless they are all points of the run."""
     if n_kept == count:
         return
     for n in range(n_kept):

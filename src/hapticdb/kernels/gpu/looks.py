@@ -9,7 +9,8 @@ point, so that a tool takes the same path as on the CPU.
 """
 
 import functools
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 
 import numpy as np
 from numba import cuda, float64, int64
@@ -52,34 +53,22 @@ _along_and_about, _bends_at, _may_be_hollow = map(
 )
 
 
-class Sight(NamedTuple):
-    """Device view of a tool of N points in R runs, and the results of a query.
+Sight = namedtuple(  # noqa: PYI024 - all fields are arrays of the GPU
+    "Sight",
+    "points spheres due run_due due_before run_due_before epochs seen due_runs asked used missed "
+    "found points_near near",
+)
+"""Device view of a tool of N points in R runs, and the results of a query.
 
-    points (3, N + 1): m, last the centre; spheres (R, 4), or none for a small tool. due (N,),
-    run_due (R,): as in the record POINT; due_before, run_due_before: the values overwritten by the
-    last query; epochs (R,) int64: epoch in which the run's `due` was written, valid only in the
-    current one; seen (R,) int64: number of the last query of the run; due_runs (R,) int64: runs of
-    the second launch. `asked` (1,): a query's LOOK. used (S,) uint8: slots read. missed
-    (ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. `found` (FOUND,).
-    points_near (M,) int64 and near (NEAR_NUMBERS, M): the near points, at most M, in host memory;
-    values of neighbouring points are adjacent, for coalesced writes.
-    """
-
-    points: Any
-    spheres: Any
-    due: Any
-    run_due: Any
-    due_before: Any
-    run_due_before: Any
-    epochs: Any
-    seen: Any
-    due_runs: Any
-    asked: Any
-    used: Any
-    missed: Any
-    found: Any
-    points_near: Any
-    near: Any
+points (3, N + 1): m, last the centre; spheres (R, 4), or none for a small tool. due (N,),
+run_due (R,): as in the record POINT; due_before, run_due_before: the values overwritten by the
+last query; epochs (R,) int64: epoch in which the run's `due` was written, valid only in the
+current one; seen (R,) int64: number of the last query of the run; due_runs (R,) int64: runs of
+the second launch. `asked` (1,): a query's LOOK. used (S,) uint8: slots read. missed
+(ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. `found` (FOUND,).
+points_near (M,) int64 and near (NEAR_NUMBERS, M): the near points, at most M, in host memory;
+values of neighbouring points are adjacent, for coalesced writes.
+"""
 
 
 @cuda.jit

@@ -6,10 +6,9 @@ farthest point at the point's next evaluation. Runs of points are deferred likew
 """
 
 import math
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.field.lattice import HALF_WIDTH
@@ -210,26 +209,17 @@ def _goes_nearer(u, bound, before):
     return (u < FLOOR and u <= before.u) or (bound < LEAST_BOUND and bound <= before.bound)
 
 
-class Grasp(NamedTuple):
-    """Arguments of a tool's proximity queries: input, state and output.
+Grasp = namedtuple(  # noqa: PYI024 - its types are those of the cells that a kernel reads
+    "Grasp", "cells which shell place follower kept near bends met missed"
+)
+"""Arguments of a tool's proximity queries: input, state and output.
 
-    cells : `Cells` with distances; which : the frame's directory; shell : `Clusters`; place : the
-    grid; follower : record of FOLLOWER; kept (N,) of POINT; near (2, N) of NEAR, bends (2, N) of
-    BENDS : near points of two poses, in the order of the points, row `follower.side` for the tool's
-    pose; met (N,) int64 : points in contact; missed (1 + MOST_MISSED,) int64 : unknown cells, as in
-    `feeling.felt`.
-    """
-
-    cells: Any
-    which: int
-    shell: Any
-    place: Any
-    follower: Any
-    kept: Any
-    near: Any
-    bends: Any
-    met: NDArray[np.int64]
-    missed: NDArray[np.int64]
+cells : `Cells` with distances; which : the frame's directory; shell : `Clusters`; place : the
+grid; follower : record of FOLLOWER; kept (N,) of POINT; near (2, N) of NEAR, bends (2, N) of
+BENDS : near points of two poses, in the order of the points, row `follower.side` for the tool's
+pose; met (N,) int64 : points in contact; missed (1 + MOST_MISSED,) int64 : unknown cells, as in
+`feeling.felt`.
+"""
 
 
 @leaf

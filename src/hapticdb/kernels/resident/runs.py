@@ -1,6 +1,6 @@
 """Runs of a shell's points: culling by bounding spheres, and cells of the other runs."""
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     GROUP,
     UNKNOWN,
-    Floats,
     in_voxels,
     key_of_cell,
     slot_of,
@@ -32,44 +31,23 @@ FURTHEST = float(1 << 22)
 """Coordinate beyond every grid and within 32 bits, voxels."""
 
 
-class Scratch(NamedTuple):
-    """Placed run of a shell: rows of `Clusters.scratch`, each with a number for each point.
+Scratch = namedtuple(  # noqa: PYI024 - each field is an array (run,) of floats
+    "Scratch",
+    "px py pz x y z nx ny nz number base word bit kept look_up part_x part_y part_z here there "
+    "depth weight slot_of base_of",
+)
+"""Placed run of a shell: rows of `Clusters.scratch`, each with a number for each point.
 
-    px, py, pz : metres. x, y, z : voxels. nx, ny, nz : rotated normal. number : index of the point.
-    base : start of its cell's distances, less the offset of the cell's first centre. word, bit : of
-    its voxel, in the words of the whole table. kept : indices for `keep_points`. look_up : index of
-    the lowest corner of an interpolation. part_x, part_y, part_z : fractions between its corners.
-    here, there : distance at the point and ahead of it, voxels. depth : m. weight. slot_of,
-    base_of : of the run's cells.
+px, py, pz : metres. x, y, z : voxels. nx, ny, nz : rotated normal. number : index of the point.
+base : start of its cell's distances, less the offset of the cell's first centre. word, bit : of
+its voxel, in the words of the whole table. kept : indices for `keep_points`. look_up : index of
+the lowest corner of an interpolation. part_x, part_y, part_z : fractions between its corners.
+here, there : distance at the point and ahead of it, voxels. depth : m. weight. slot_of,
+base_of : of the run's cells.
 
-    Rows are separate arrays, not records of points, so the compiler vectorizes loops over points.
-    Indices are integers below 2^53, exact in a float.
-    """
-
-    px: Floats
-    py: Floats
-    pz: Floats
-    x: Floats
-    y: Floats
-    z: Floats
-    nx: Floats
-    ny: Floats
-    nz: Floats
-    number: Floats
-    base: Floats
-    word: Floats
-    bit: Floats
-    kept: Floats
-    look_up: Floats
-    part_x: Floats
-    part_y: Floats
-    part_z: Floats
-    here: Floats
-    there: Floats
-    depth: Floats
-    weight: Floats
-    slot_of: Floats
-    base_of: Floats
+Rows are separate arrays, not records of points, so the compiler vectorizes loops over points.
+Indices are integers below 2^53, exact in a float.
+"""
 
 
 @inlined
@@ -141,7 +119,7 @@ def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
 
 
 @inlined
-def is_sphere_free(seen, spheres, n, transform, place, reached):
+def _is_sphere_free(seen, spheres, n, transform, place, reached):
     """Whether no voxel is in the AABB of sphere n of a placed shell, enlarged by `reached` voxels.
 
     Unknown cells count as occupied; space outside the grid is free.
@@ -165,24 +143,6 @@ def is_sphere_free(seen, spheres, n, transform, place, reached):
 
 
 @inlined
-def is_block_free(seen, spheres, groups, cluster, transform, place, reached):
-    """Whether run `cluster` is the first of a block far from all voxels."""
-    n_runs = spheres.shape[0]
-    return (
-        n_runs >= BLOCK
-        and cluster % BLOCK == 0
-        and is_sphere_free(
-            seen,
-            groups,
-            (n_runs + GROUP - 1) // GROUP + cluster // BLOCK,
-            transform,
-            place,
-            reached,
-        )
-    )
-
-
-@inlined
 def _free_runs(seen, shell, run, transform, place, reached):
     """Number of runs, from `run` on, farther than `reached` voxels from all: BLOCK, GROUP, 1 or 0.
 
@@ -191,11 +151,14 @@ def _free_runs(seen, shell, run, transform, place, reached):
     spheres, groups = shell.spheres, shell.groups
     if spheres.shape[0] == 0:
         return np.int64(groups[run, 0]) if groups.shape[0] > 0 else np.int64(0)
-    if is_block_free(seen, spheres, groups, run, transform, place, reached):
-        return BLOCK
-    if run % GROUP == 0 and is_sphere_free(seen, groups, run // GROUP, transform, place, reached):
+    n_runs = spheres.shape[0]
+    if run % BLOCK == 0 and n_runs >= BLOCK:
+        block = (n_runs + GROUP - 1) // GROUP + run // BLOCK
+        if _is_sphere_free(seen, groups, block, transform, place, reached):
+            return BLOCK
+    if run % GROUP == 0 and _is_sphere_free(seen, groups, run // GROUP, transform, place, reached):
         return GROUP
-    return 1 if is_sphere_free(seen, spheres, run, transform, place, reached) else 0
+    return 1 if _is_sphere_free(seen, spheres, run, transform, place, reached) else 0
 
 
 @inlined

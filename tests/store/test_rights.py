@@ -364,6 +364,7 @@ def lines(url: str) -> dict[str, list[str]]:
         **{verb: [url, "copy.db"] for verb in ("copy", "diff")},
         "grant": [url, "pg_monitor", "--as", "viewer"],
         "clashes": [url],
+        "distance": [url, "1", "2"],
         **{verb: [url, "1"] for verb in ("extract", "remove")},
         "demo": ["shown", "--url", url],
         "view": [url, "--no-browser", "--seconds", "1"],

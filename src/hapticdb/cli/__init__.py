@@ -1,7 +1,7 @@
-"""The command line: parse, call, print.
+"""Command line: parse, call, print.
 
-Results go to standard output, progress and errors to standard error. A user's error is one line
-and exit code 2; anything unforeseen one line and exit code 1, its traceback behind ``--debug``.
+Results go to standard output, progress and errors to standard error. A user's error prints one line
+and exits with 2, any other exception one line and exits with 1; ``--debug`` adds the traceback.
 """
 
 import contextlib
@@ -65,11 +65,11 @@ VERBS: dict[Callable[..., None], str] = {
     demo: "Make, import, touch and draw the sample.",
     sample: "Write a sample: a car, a wrench and its path.",
 }
-"""The verbs, and the line about each in the list of verbs."""
+"""Verbs, each with its line in the list of verbs."""
 HIDDEN = {sample}
-"""Verbs that the list leaves out: what they do, others do by themselves."""
+"""Verbs omitted from the list of verbs: `demo` writes the sample itself."""
 HELP = {clashes: CLASHES_HELP, sweep: SWEEP_HELP, extract: EXTRACT_HELP}
-"""Help texts that are too long for a docstring, so that no function is over 60 lines."""
+"""Help texts too long for a docstring, since functions have at most 60 lines."""
 for verb, summary in VERBS.items():
     app.command(
         verb.__name__.rstrip("_"), short_help=summary, help=HELP.get(verb), hidden=verb in HIDDEN
@@ -77,7 +77,7 @@ for verb, summary in VERBS.items():
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line, that of the process unless given, and return its exit code."""
+    """Run a command line, by default the process's own, and return its exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     is_debugging = "--debug" in takewhile(lambda arg: arg.startswith("-"), args)
     _print_anything()
@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _close_stdout()
         return PIPE_CLOSED
     except (KeyboardInterrupt, Interrupted) as error:
-        interrupting.leave()  # once more would be told once more
+        interrupting.leave()  # a further Ctrl-C would print another line
         return _fail(str(error) or "interrupted", INTERRUPTED)
     except HapticDBError as error:
         return _fail(str(error), USER_ERROR, show_trace=is_debugging)
@@ -112,7 +112,7 @@ def _fail(message: str, code: int, *, show_trace: bool = False) -> int:
 
 
 def _usage(error: Exception) -> str:
-    """Typer's complaint as one line that says where to look."""
+    """Typer's message as one line, with the verb's ``--help``."""
     text = str(error.format_message()).replace("Value error, ", "").rstrip(".")  # type: ignore[attr-defined]
     text = re.sub(r" \(Possible options: (.*)\)", r"; did you mean \1?", text)
     context = getattr(error, "ctx", None)
@@ -121,13 +121,13 @@ def _usage(error: Exception) -> str:
 
 
 def _print_anything() -> None:
-    """Print what the terminal's encoding lacks in ASCII or as escapes, and not as an error."""
+    """Replace characters outside the terminal's encoding by ASCII or escapes, without errors."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="as_ascii")
 
 
 def _close_stdout() -> None:
-    """Send what is left to nowhere: the reader of standard output (``| head``) has closed it."""
+    """Redirect standard output to the null device: its reader (``| head``) has closed it."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""An environment opened, and objects that the words of an option choose."""
+"""Opening of environments, and selection of objects by the words of an option."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Felt(NamedTuple):
-    """Words of --where and --exclude, and ids of the objects that are left out now."""
+    """Words of ``--where`` and ``--exclude``, and ids of the objects excluded by them now."""
 
     where: list[str]
     exclude: list[int | str]
@@ -21,13 +21,13 @@ class Felt(NamedTuple):
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """The options that say which objects are felt."""
+    """Options ``--where`` and ``--exclude``: filter of the objects with contacts."""
 
     where: list[str] | None = None
     exclude: list[str] | None = None
 
     def felt(self, env: "Environment", parts: Iterable[int] = ()) -> Felt:
-        """Check the words; parts : ids of what moves, which is not felt."""
+        """Filter of checked words; parts : ids of moving objects, excluded, too."""
         words = as_named(env, self.where or (), "--where")
         more = as_named(env, self.exclude or (), "--exclude")
         _found(env, words, "--where")
@@ -40,7 +40,7 @@ class FilterOptions:
 
 
 def opened_to_keep(url: str) -> "Environment":
-    """Open to write, so that what is found is kept; to read where this user may do no more."""
+    """Open an environment for writing, to store results; read-only for users without that right."""
     import hapticdb
     from hapticdb.errors import ReadOnlyError
 
@@ -51,7 +51,7 @@ def opened_to_keep(url: str) -> "Environment":
 
 
 def chosen(env: "Environment", words: Iterable[str], option: str) -> "list[Object]":
-    """Objects that the words of an option choose, ordered by id; the error names the option."""
+    """Objects chosen by the words of an option, ordered by id; the error names the option."""
     return _found(env, as_named(env, words, option), option)
 
 
@@ -65,7 +65,7 @@ def _found(env: "Environment", words: list[str], option: str) -> "list[Object]":
 
 
 def as_named(env: "HasObjects", words: Iterable[str], option: str) -> list[str]:
-    """Words with a number as a name where no object has that id; says how numbers are taken."""
+    """Words of an option; a number that fits only a name becomes a name. Notes such numbers."""
     from hapticdb.cli import render
     from hapticdb.errors import ObjectNotFoundError
     from hapticdb.store.finding import NAME, find_objects, is_id
@@ -86,5 +86,5 @@ def as_named(env: "HasObjects", words: Iterable[str], option: str) -> list[str]:
 
 
 def ids_of(env: "Environment", words: Iterable[str] | None, option: str) -> list[int]:
-    """Ids of those objects."""
+    """Ids of the objects chosen by the words of an option."""
     return [obj.id for obj in chosen(env, words or (), option)]

@@ -1,8 +1,8 @@
-"""Results as JSON and CSV, from one record of each; to standard output, or to a file whole or not.
+"""Results as JSON and CSV from the same records, to standard output or atomically to a file.
 
 A record has the keys of docs/results.md, in SI units; a column of CSV has its key and its unit.
-Numbers are written so that they are read back bit for bit. A name that a spreadsheet would take for
-a formula gets an apostrophe in front, which is how spreadsheets themselves mark text.
+Numbers round-trip bit for bit. A name like a spreadsheet's formula gets an apostrophe in front, the
+spreadsheets' own mark of text.
 """
 
 import csv
@@ -20,19 +20,19 @@ from hapticdb.errors import FileError, HapticDBError, UsageError
 
 STDOUT = "-"
 FORMULAS = ("=", "+", "-", "@")
-"""What a cell begins with that a spreadsheet computes instead of showing it."""
+"""First characters of a cell with a formula."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """Where the result of a verb goes: words, unless JSON takes their place."""
+    """Standard output of a verb's result: words, or JSON in their place."""
 
     json: bool = False
 
     def emit(
         self, result: object, words: str | Callable[[], object], status: int | None = None
     ) -> None:
-        """Write a result as JSON, or its words: a line, or what prints them; status : as `say`."""
+        """Write a result as JSON, or its words: a line or a function; status : as `render.say`."""
         if self.json:
             render.say_json(result)
         elif isinstance(words, str):
@@ -43,7 +43,7 @@ class Output:
 
 @dataclass(frozen=True)
 class TableOutput(Output):
-    """Where a result of many rows goes: also to CSV."""
+    """Output of a result with many rows: also as CSV."""
 
     csv: str | None = None
 
@@ -52,7 +52,7 @@ class TableOutput(Output):
             raise UsageError("--csv - and --json: only one may be standard output")
 
     def add(self, table: "CsvWriter | None", *records: Mapping[str, Any]) -> None:
-        """Write records as lines of JSON, and as rows of a table that is open."""
+        """Write records as lines of JSON, and as rows of an open table."""
         if table is not None:
             table.add(*records)
         for one in records if self.json else ():
@@ -65,19 +65,19 @@ class TableOutput(Output):
 
 
 class CsvWriter:
-    """Rows that are written as CSV below a header, to a stream that translates no ends of lines."""
+    """CSV rows below a header, on a stream without translation of line ends."""
 
     def __init__(self, stream: TextIO, keys: Sequence[str]) -> None:
         self._writer, self._keys = csv.writer(stream, lineterminator="\n"), keys
         self._is_begun = False
 
     def add(self, *records: Mapping[str, Any]) -> None:
-        """Add a row of each record; a key that it lacks leaves its columns empty."""
+        """Add a row for each record; columns of missing keys stay empty."""
         self.write([cell for key in self._keys for cell in _cells(key, one)] for one in records)
 
     def write(self, rows: Iterable[Sequence[object]] = ()) -> None:
-        """Add rows; a float as the shortest text that is read back as the same float64."""
-        if not self._is_begun:  # not before there is something to say
+        """Add rows; a float as the shortest text of the same float64."""
+        if not self._is_begun:  # an error before the first row prints no header
             self._writer.writerow([name for key in self._keys for name in COLUMNS.get(key, (key,))])
             self._is_begun = True
         self._writer.writerows(rows)
@@ -97,7 +97,7 @@ def _cells(key: str, record: Mapping[str, Any]) -> Sequence[object]:
 def open_csv(
     target: str | None, keys: Sequence[str], option: str = "--csv"
 ) -> Iterator[CsvWriter | None]:
-    """Open a new CSV file for writing; None where none is given. After an error no file is left."""
+    """Open a new CSV file for writing; None without a target. After an error no file remains."""
     with ExitStack() as stack:
         made = None
         if target == STDOUT:
@@ -113,7 +113,7 @@ def open_csv(
 
 @contextmanager
 def new_file(target: Path, option: str) -> Iterator[Path]:
-    """Path to write to, which becomes the target at the end. After an error no file is left."""
+    """Temporary path, renamed to the target at the end. After an error no file remains."""
     if not target.name or os.path.lexists(target):
         raise UsageError(f"{option} '{target}': give the name of a file that is not there yet")
     part = target.with_name(f".{target.name}.{os.getpid()}.part")
@@ -134,7 +134,7 @@ def new_file(target: Path, option: str) -> Iterator[Path]:
 
 @contextmanager
 def new_files(**named: str | None) -> Iterator[dict[str, Path]]:
-    """Paths to write to, as `new_file` has them, of the files that are given, by option."""
+    """Temporary paths of `new_file` for the given files, by option."""
     with ExitStack() as stack:
         yield {
             name: stack.enter_context(new_file(Path(file), f"--{name}"))

@@ -1,4 +1,4 @@
-"""Results of many poses as one table in a file, Parquet or .npz: whole or not at all."""
+"""Contacts of many poses as one table, in a Parquet or .npz file, written atomically."""
 
 import importlib.util
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ OPTION = "--out"
 
 
 def columns_of(first: int, felt: "TouchBatch") -> "Columns":
-    """Columns of a batch whose first pose has that index; `revision` is the one that was felt."""
+    """Columns of a batch from pose `first` on; `revision` is the environment's in the batch."""
     import numpy as np
 
     wrenches = [*felt.forces.T, *felt.torques.T]
@@ -38,7 +38,7 @@ def columns_of(first: int, felt: "TouchBatch") -> "Columns":
 
 @contextmanager
 def open_felt(target: Path) -> "Iterator[Callable[[Columns], None]]":
-    """Open a new file, whose suffix says of which kind; yields what adds rows to it."""
+    """Open a new file, Parquet or .npz by its suffix; yields the function for adding rows."""
     if target.suffix not in {".parquet", ".npz"}:
         raise UsageError(f"{OPTION} '{target}': give a name that ends with .parquet or .npz")
     if target.suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
@@ -51,7 +51,7 @@ def open_felt(target: Path) -> "Iterator[Callable[[Columns], None]]":
 
 
 def _row_groups(path: Path) -> "Iterator[Callable[[Columns], None]]":
-    """Rows are written as they come."""
+    """Function for adding rows to a Parquet file: each piece is written at once."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -68,7 +68,7 @@ def _row_groups(path: Path) -> "Iterator[Callable[[Columns], None]]":
 
 
 def _arrays(path: Path) -> "Iterator[Callable[[Columns], None]]":
-    """Rows stay in memory until the end."""
+    """Function for adding rows to a .npz file: pieces stay in memory until the end."""
     import numpy as np
 
     pieces: list[Columns] = []

@@ -1,4 +1,4 @@
-"""The hand that `feel --device` names."""
+"""Devices and scripted hands of `feel --device`."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,14 +15,14 @@ VENDORS = {
     "openhaptics": ("hapticdb.devices.vendors.openhaptics", "OpenHapticsDevice"),
     "haply": ("hapticdb.devices.vendors.haply", "HaplyDevice"),
 }
-"""Module and class of each device that can be bought, by its word."""
+"""Module and class of each commercial device, by its word."""
 RANDOM_SPEED = 0.3
-"""Greatest speed of a random hand unless --speed is given, m/s."""
+"""Default greatest speed of a random hand, m/s."""
 
 
 @dataclass(frozen=True)
 class HandOptions:
-    """The options that say whose hand feels, and how its motion reaches the tool."""
+    """Options of the device or scripted hand, and of the mapping of its motion to the tool."""
 
     device: str
     speed: float | None = None
@@ -33,7 +33,7 @@ class HandOptions:
     clutch: int | None = None
 
     def open(self, seed: int, profile: "DeviceProfile | None") -> "tuple[Device, float | None]":
-        """Open the device, or read the motion; also the speed assumed for a path without times."""
+        """Device, or hand on a motion; also the assumed speed of a path without times, m/s."""
         self._check(seed)
         if self.device in VENDORS:
             return self._vendor_device(profile), None
@@ -42,7 +42,7 @@ class HandOptions:
         return _simulated(hand, profile) if self.simulate else hand, assumed
 
     def _check(self, seed: int) -> None:
-        """Refuse options that the hand does not take."""
+        """UsageError for options without meaning for the hand."""
         word = self.device
         if seed < 0:
             raise UsageError(f"--seed {seed}: give 0 or more")
@@ -68,7 +68,7 @@ class HandOptions:
         return device
 
     def _scripted(self, seed: int) -> "Device":
-        """The hand that a motion moves."""
+        """Hand on a random motion, a recorded one, or a path of poses."""
         from hapticdb.devices import scripted
         from hapticdb.recording.file import Recording
 
@@ -88,7 +88,7 @@ class HandOptions:
 
 
 def _simulated(hand: "Device", profile: "DeviceProfile | None") -> "Device":
-    """Device that a hand holds, with cap and mass of the profile."""
+    """Simulated device driven by a hand, with cap and mass of the profile."""
     from hapticdb.devices.simulated import SimulatedDevice
 
     if profile is None:

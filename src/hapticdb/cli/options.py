@@ -1,4 +1,4 @@
-"""Arguments and options of the verbs, each with its value, its default and its help, once."""
+"""Arguments and options of the verbs: value, default and help of each, in one place."""
 
 import re
 from collections.abc import Callable
@@ -214,12 +214,12 @@ demo.points N: Points of the tool.
 and choices. A length is read in the unit after its slash unless it has its own; its verb gets
 metres."""
 _ALSO = {"serve": "view", "sample": "demo", "demo": "sample"}
-"""Verbs that share texts with another one."""
+"""Verbs with the texts of another verb as well."""
 _ENTRY = re.compile(r"^([a-z_.]+)(?: ([^\[\n]+?))?(?: \[([^]]*)\])?:\s((?:.|\n  )*)", re.MULTILINE)
 
 
 class _Text(NamedTuple):
-    """What the help shows: of the value, the default, and the words."""
+    """Help of a parameter: placeholder of its value, default, and words."""
 
     value: str | None
     default: str | None
@@ -233,7 +233,7 @@ _TEXTS = {
 
 
 def command(verb: Callable[..., None]) -> Callable[..., None]:
-    """A verb as typer calls it: each parameter with its text, each dataclass as its fields."""
+    """Verb in typer's form: parameters with their texts, dataclasses flattened to their fields."""
     parameters = signature(verb).parameters
     groups = {
         name: tuple(signature(one.annotation).parameters.values())
@@ -259,7 +259,7 @@ def command(verb: Callable[..., None]) -> Callable[..., None]:
 
 
 def _documented(verb: str, parameter: Parameter, *, is_option: bool) -> Parameter:
-    """Parameter with what typer needs of it."""
+    """Parameter with typer's annotation: flags, metavar, help, parser."""
     name = parameter.name.rstrip("_")
     keys = (f"{verb}.{name}", f"{_ALSO.get(verb)}.{name}", name)
     text = next(_TEXTS[key] for key in keys if key in _TEXTS)
@@ -286,5 +286,5 @@ def _documented(verb: str, parameter: Parameter, *, is_option: bool) -> Paramete
 
 
 def _unless_read(parse: Callable[[str], object]) -> Callable[[object], object]:
-    """Parser that leaves a default as it is."""
+    """Parser of texts; returns a default, parsed before, unchanged."""
     return lambda given: parse(given) if isinstance(given, str) else given

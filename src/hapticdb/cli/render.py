@@ -1,4 +1,4 @@
-"""What people see: tables and notes; bars on a terminal only."""
+"""Text for people: tables, facts and notes; progress bars on a terminal only."""
 
 import codecs
 import json
@@ -26,42 +26,42 @@ if TYPE_CHECKING:
 _UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
 )
-"""Controls of a terminal, and of the direction of writing; a line's end is neither."""
+"""Control characters of terminals and of the direction of writing, without the line feed."""
 NEW_LINE = "\n"
 COLOURS = {0: 32, 1: 31}
-"""Green and red of a terminal, for exit codes of verdicts; others are yellow, 33."""
+"""Green and red of a terminal, by a verdict's exit code; others are yellow, 33."""
 ASCII = {"─": "-", "…": "...", "µ": "u", "±": "+-", "³": "3"}
-"""What stands for our characters where an encoding lacks them."""
+"""Replacements of our own characters, for encodings without them."""
 NARROW = 8
-"""Columns that a cut text has at least."""
+"""Least width of a shortened text, columns."""
 GAP, FACTS_GAP = 3, 2
 """Blanks between two columns of a table, and between a name and its value."""
 
 
 def printable(text: str) -> str:
-    r"""Text that is safe to print on a terminal; names of parts and files may hold anything.
+    r"""Text safe for a terminal; names of parts and files may contain any character.
 
-    What would move the cursor, change colours or turn the direction of writing is shown as an
-    escape, such as ``\x1b``.
+    Characters for cursor movements, colours or the direction of writing become escapes, such as
+    ``\x1b``.
     """
     return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def note(text: str) -> None:
-    """Say something on standard error, in a line."""
+    """Print one line on standard error."""
     print(f"hapticdb: {printable(' '.join(text.split(NEW_LINE)))}", file=sys.stderr)
 
 
 @contextmanager
 def noting_warnings() -> Iterator[None]:
-    """Say warnings of the library in a line each."""
+    """Print warnings of the library as notes, a line each."""
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: note(str(message))
         yield
 
 
 def program() -> str:
-    """Give this program as a person can type it: by its name, or by the path that it was run by."""
+    """Command of this program for a shell: its name if the PATH leads here, else its path."""
     run = sys.argv[0]
     return "hapticdb" if shutil.which("hapticdb") == str(Path(run).absolute()) else shlex.quote(run)
 
@@ -77,7 +77,7 @@ def say(text: str = "", status: int | None = None) -> None:
 
 
 def as_ascii(error: UnicodeError) -> tuple[str, int]:
-    """Replace what an encoding lacks, by `ASCII` or an escape: a handler of encoding errors."""
+    """Handler of encoding errors: replacement of `ASCII`, or an escape."""
     assert isinstance(error, UnicodeEncodeError)  # noqa: S101 - of a stream that is written
     lacking = error.object[error.start : error.end]
     escaped = (ASCII.get(one) or one.encode("unicode_escape").decode() for one in lacking)
@@ -93,7 +93,7 @@ def say_json(result: object) -> None:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print rows under headings; a heading that ends in ``>`` is of a column of numbers."""
+    """Print rows under headings; ``>`` at a heading's end marks a column of numbers."""
     numbers = [heading.endswith(">") for heading in headings]
     lines = _laid([[heading.rstrip(">") for heading in headings], *rows], numbers)
     rule = "─" * (max(map(_width_of, lines)) + 2)
@@ -101,7 +101,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
 
 
 def facts(rows: Iterable[tuple[str, str]]) -> None:
-    """Print names and values, a pair a line; on a terminal long ones in lines below one another."""
+    """Print names and values, a pair a line; on a terminal long values are wrapped."""
     pairs = [*rows]
     indent = max(len(name) for name, _ in pairs) + FACTS_GAP
     for name, value in pairs:
@@ -112,12 +112,12 @@ def facts(rows: Iterable[tuple[str, str]]) -> None:
 
 
 def _room() -> int:
-    """Columns of the terminal; as many as are needed where there is none."""
+    """Width of the terminal, columns; unlimited without a terminal."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
 
 
 def _cut(text: str, width: int) -> str:
-    """Text without its middle, so that it is no wider."""
+    """Text of at most a width, columns, with an ellipsis for its middle if it is longer."""
     if _width_of(text) <= width:
         return text
     head = (width - 1) // 3
@@ -125,9 +125,9 @@ def _cut(text: str, width: int) -> str:
 
 
 def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool]) -> list[str]:
-    """Lines of rows whose columns are as wide as they need, or texts cut to fit a terminal.
+    """Lines of rows with aligned columns, the widest texts shortened to fit a terminal.
 
-    Of 4,000 objects a general table library laid out the columns in 9.8 of 11 s, under a profiler.
+    A general table library took 9.8 of 11 s for the columns of 4,000 objects, under a profiler.
     """
     cells = [[printable(text).replace(NEW_LINE, "\\n") for text in row] for row in rows]
     widths = [max(map(_width_of, column)) for column in zip(*cells, strict=True)]
@@ -148,7 +148,7 @@ def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool]) -> list[str]:
 
 
 def _width_of(text: str) -> int:
-    """Columns that a text takes on a terminal."""
+    """Width of a text on a terminal, columns."""
     if text.isascii():
         return len(text)
     kinds = [character for character in text if category(character) not in {"Mn", "Me", "Cf"}]
@@ -156,7 +156,7 @@ def _width_of(text: str) -> int:
 
 
 def counted(n: float, noun: str = "") -> str:
-    """Put a count in words: ``1 object``, ``3,412 rows``, ``14.8 million voxels``."""
+    """Count in words: ``1 object``, ``3,412 rows``, ``14.8 million voxels``."""
     for size, word in ((1e12, "million million"), (1e9, "billion"), (1e6, "million")):
         if n >= size:
             number = f"{n / size:.3g} {word}"
@@ -168,7 +168,7 @@ def counted(n: float, noun: str = "") -> str:
 
 
 def bytes_text(n: float) -> str:
-    """Put bytes in words: ``13.5 MB``."""
+    """Bytes in words: ``13.5 MB``."""
     for size, word in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
         if n >= size:
             return f"{n / size:.3g} {word}"
@@ -176,7 +176,7 @@ def bytes_text(n: float) -> str:
 
 
 def box(bounds: "NDArray[np.float64]") -> str:
-    """Put a box (2, 3), metres, in words: ``4.28 x 1.9 x 1.4 m, from (0, 0, 0) to (4.28, ...)``."""
+    """AABB (2, 3), metres, in words: ``4.28 x 1.9 x 1.4 m, from (0, 0, 0) to (4.28, ...)``."""
     from hapticdb.units import place_text
 
     step = float((bounds[1] - bounds[0]).max()) / 1e5
@@ -186,7 +186,7 @@ def box(bounds: "NDArray[np.float64]") -> str:
 
 
 def box_record(bounds: "NDArray[np.float64] | None") -> dict[str, list[float]] | None:
-    """Put a box (2, 3), metres, in JSON; null for none."""
+    """AABB (2, 3), metres, for JSON; null for none."""
     if bounds is None:
         return None
     low, high = bounds.tolist()
@@ -194,7 +194,7 @@ def box_record(bounds: "NDArray[np.float64] | None") -> dict[str, list[float]] |
 
 
 def percent(share: float) -> str:
-    """Put a share in words; a share below 1 is never shown as 100 %."""
+    """Share in per cent; a share below 1 is never rounded to 100 %."""
     text = f"{100 * share:.3g}"
     if share < 1.0 and text == "100":
         text = ">99.9"
@@ -202,7 +202,7 @@ def percent(share: float) -> str:
 
 
 def shares(counts: Mapping[str, int]) -> str:
-    """Put counts in words, largest first: ``array 93 %, cbgroup 7 %``."""
+    """Counts as shares, largest first: ``array 93 %, cbgroup 7 %``."""
     total = sum(counts.values()) or 1
     ranked = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     return ", ".join(f"{name} {100 * n / total:.3g} %" for name, n in ranked)
@@ -210,17 +210,17 @@ def shares(counts: Mapping[str, int]) -> str:
 
 @contextmanager
 def import_bar() -> "Iterator[ImportCallback | None]":
-    """Show how many parts of a file are imported; see `bar`."""
+    """Progress bar of the imported parts of a file; see `bar`."""
     with bar("importing", "parts") as tell:
         yield tell and (lambda now: tell(now.parts_done + now.share, now.parts_total))
 
 
 @contextmanager
 def bar(doing: str, noun: str, *, of: int = 1) -> "Iterator[Callable[[float, int], None] | None]":
-    """Show a bar with counts, in multiples `of` so many, and the time left.
+    """Progress bar with counts, divided by `of`, and the remaining time.
 
-    Yields a callback of the library, `store.base.Progress`, whose total is 0 where that is not
-    known; None where standard error is no terminal.
+    Yields a callback of the library, `store.base.Progress`, with a total of 0 for an unknown one;
+    None if standard error is no terminal.
     """
     if not sys.stderr.isatty():
         yield None

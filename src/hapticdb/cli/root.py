@@ -1,4 +1,4 @@
-"""The typer application, its global options, and how a signal ends it."""
+"""The typer application, its global options, and its end by signals."""
 
 import signal
 import threading
@@ -13,12 +13,12 @@ from hapticdb import interrupting
 
 
 class Interrupted(Exception):  # noqa: N818 - no error: the user pressed Ctrl-C
-    """Ctrl-C, with what the user should know about the state that is left."""
+    """Ctrl-C, with a message on the state of the data."""
 
 
 @contextmanager
 def left_at(state: str) -> Iterator[None]:
-    """Say what is left when Ctrl-C ends the block."""
+    """Add the state of the data to the message if Ctrl-C ends the block."""
     try:
         yield
     except KeyboardInterrupt:
@@ -26,7 +26,7 @@ def left_at(state: str) -> Iterator[None]:
 
 
 class PipeClosedError(Exception):
-    """The reader of standard output has closed it, as ``| head`` does."""
+    """Standard output closed by its reader, as by ``| head``."""
 
 
 class Verbs(typer.core.TyperGroup):
@@ -56,7 +56,7 @@ app = typer.Typer(
 
 @contextmanager
 def leaving_in_order() -> Iterator[None]:
-    """Let SIGTERM end the program through every clean-up: servers are stopped, devices released."""
+    """Let SIGTERM end the program with all clean-up: servers are stopped, devices released."""
     is_ours = threading.current_thread() is threading.main_thread()
     if not is_ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield  # another handler stays
@@ -69,12 +69,12 @@ def leaving_in_order() -> Iterator[None]:
 
 
 def leave(number: int, _: object) -> None:
-    """End the program with the exit code of a signal: a signal handler."""
+    """Signal handler: end the program with the signal's exit code."""
     raise SystemExit(128 + number)
 
 
 TERMINATED = 128 + signal.SIGTERM
-"""Exit code of a verb that SIGTERM has ended in order."""
+"""Exit code of a verb after SIGTERM and its clean-up."""
 
 
 def _show_version(*, wanted: bool) -> None:
@@ -102,17 +102,17 @@ def root(
 ) -> None:
     """Feel a virtual environment too large for memory: haptic queries on an SQL database.
 
-    A first visit:
+    First steps:
 
     \b
       hapticdb demo
       hapticdb import car.db car.glb --bits 11
       hapticdb touch car.db --tool wrench.stl --poses path.csv
 
-    Instead of a file's path, a URL names an environment on PostgreSQL:
+    A URL instead of a path opens an environment on PostgreSQL:
     'postgresql://user@host/database?environment=NAME'.
 
-    'hapticdb VERB --help' shows what a verb takes, with an example.
+    'hapticdb VERB --help' explains a verb and its options, with an example.
     """  # noqa: D301 - the help text's mark of lines that stay as they are
     del version, debug  # seen by their callbacks and by `main`
     if context.invoked_subcommand is None:
@@ -121,7 +121,7 @@ def root(
 
 @contextmanager
 def ended_by_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
-    """Let Ctrl-C or SIGTERM call `stop`, and a second one end all; yields the signals."""
+    """Let the first Ctrl-C or SIGTERM call `stop`, a second one end all; yields the signals."""
     came: list[int] = []
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     before = {  # another's handler stays

@@ -1,4 +1,4 @@
-"""The keys of results in JSON and the columns of CSV, as docs/results.md has them; SI units."""
+"""Keys of results in JSON and columns of CSV, SI units; described in docs/results.md."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -37,9 +37,9 @@ FIELDS = {
     ),
     "WayOut": "how poses length gap proof=swept",
 }
-"""What JSON has of a result, by its class, as for `record`; of other classes all fields."""
+"""Fields of a result in JSON, by its class, in the form of `record`; other classes give all."""
 OBJECT = "id name link voxels bounds transform digest attributes revision"
-"""What JSON has of an object that is a result itself."""
+"""Fields of an object in JSON, if it is a result itself."""
 AXES = ("x", "y", "z")
 _POSE = (*(f"{axis}_m" for axis in AXES), "qw", "qx", "qy", "qz")
 _SPEED = (*(f"v{axis}_m_per_s" for axis in AXES), *(f"w{axis}_rad_per_s" for axis in AXES))
@@ -66,11 +66,11 @@ COLUMNS = {
         "scale", "radius_m", "hold_s", "fade_s",
     ),
 }  # fmt: skip
-"""Columns of keys that have a unit, or several numbers; another key is its own column."""
+"""Columns of keys with a unit or several numbers; another key is its own column."""
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 - a part of a result
-    """A result or a part of it as JSON has it; infinity and NaN, which it lacks, are None."""
+    """Result, or a part of it, as values of JSON; infinity and NaN become None."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, str | int):
@@ -91,7 +91,7 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - a part of a result
 
 
 def record(value: object, names: str | Iterable[str]) -> dict[str, Any]:
-    """Fields of a result, by name or ``name=path.of.attributes``; those of `object` join them."""
+    """Fields of a result, by name or ``name=path.of.attributes``; `object` adds its own fields."""
     told: dict[str, Any] = {}
     for text in names.split() if isinstance(names, str) else names:
         name, _, path = text.partition("=")

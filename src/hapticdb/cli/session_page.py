@@ -1,4 +1,4 @@
-"""What a session was like, as `feel` prints it."""
+"""Report of a session, as `feel` prints it."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from hapticdb.session.session import Session
 
 MOST_NAMED = 8
-"""Objects that were touched whose names are printed; more are counted."""
+"""Names of touched objects in the report; further ones are counted."""
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "worst": "worst"}
-"""Heading of each, and the field of a `Spread`."""
+"""Headings of the percentiles, and their fields in a `Spread`."""
 
 POINT_NS = {"plane": (50.0, 50.0), "distance": (100.0, 600.0)}
-"""Nanoseconds that a frame takes for each point near a surface under a law, in tools of up to
-`IN_CACHE` points and larger ones (57,600 points pressed on a plane, and results/realtime.json)."""
+"""Nanoseconds of a frame for each tool point near a surface, by law: in tools of up to `IN_CACHE`
+points, and in larger ones (57,600 points pressed on a plane, and results/realtime.json)."""
 IN_CACHE = 10_000
 
 Facts = list[tuple[str, str]]
 
 
 def tell_cost(n_points: int, rate: float, law: "LawName", frames_on: str = "cpu") -> None:
-    """Say in a line what a tool costs whose frames may take a processor longer than a period."""
+    """Note the cost of a tool if its frames may exceed the period on a processor."""
     seconds = 1e-9 * n_points * POINT_NS[law][n_points > IN_CACHE]
     if seconds > 1.0 / rate and frames_on == "cpu":
         render.note(
@@ -42,9 +42,9 @@ def tell_cost(n_points: int, rate: float, law: "LawName", frames_on: str = "cpu"
 
 
 class SessionPage(NamedTuple):
-    """What there is to say of a session.
+    """Report of a session, for printing and for JSON.
 
-    recording : file that it was recorded to; path_speed : assumed for a path without times, m/s.
+    recording : file of its recording; path_speed : assumed for a path without times, m/s.
     """
 
     report: "Report"
@@ -54,16 +54,16 @@ class SessionPage(NamedTuple):
     path_speed: float | None
 
     def record(self) -> dict[str, Any]:
-        """What JSON has."""
+        """Report for JSON."""
         told: dict[str, Any] = {"path_speed": self.path_speed, "shell": shell_record(self.shell)}
         told |= plain(self.report)
         told["touched"] = told.pop("objects")
         return told
 
     def show(self, began: float) -> None:
-        """Print how the loop kept its time, beside the empty loop, and what happened in it.
+        """Print the loop's timing next to the empty loop's, then the events of the session.
 
-        began : as of `perf_counter`.
+        began : start of the verb, as of `perf_counter`.
         """
         report, cache = self.report, self.report.cache
         _show_loops(report)
@@ -88,7 +88,7 @@ class SessionPage(NamedTuple):
 
 
 def _show_loops(report: "Report") -> None:
-    """Print frames, deadlines and times of the session, and of the empty loop where it ran."""
+    """Print frames, deadlines and times of the session, and of the empty loop if it ran."""
     loops = [loop for loop in (report.loop, report.empty) if loop is not None]
     rows = [
         ("frames", *(f"{loop.frames:,}" for loop in loops)),
@@ -106,7 +106,7 @@ def _show_loops(report: "Report") -> None:
 
 
 def _frame_facts(report: "Report") -> Facts:
-    """Frames that touched, that knew too little, and whose force was held."""
+    """Counts of frames: in contact, with cells missing, with an earlier wrench repeated."""
     frames = report.unknown_frames, report.held_frames, report.hit_frames
     unknown, held, hit = (render.counted(n, "frame") for n in frames)
     return [
@@ -117,7 +117,7 @@ def _frame_facts(report: "Report") -> Facts:
 
 
 def _force_facts(report: "Report") -> Facts:
-    """Law and coupling, the greatest force, and what was done to keep it stable."""
+    """Law and coupling, the greatest force, and interventions for stability."""
     from hapticdb.session.coupling import SettledCoupling, limit_text
 
     spring = report.coupling
@@ -143,7 +143,7 @@ def _force_facts(report: "Report") -> Facts:
 
 
 def loose_text(report: "Report", cells: "ResidentCells") -> str:
-    """How long the tool lay in what, and that nothing was felt."""
+    """Sentence on the time of the tool inside objects, without force."""
     frames = report.loose_frames
     start = (
         "it began inside"
@@ -157,14 +157,14 @@ def loose_text(report: "Report", cells: "ResidentCells") -> str:
 
 
 class Notes:
-    """Tells on the command line, as it happens, what a person who feels nothing should know."""
+    """Live notes on the command line: reasons for a missing force, and a recording's end."""
 
     def __init__(self) -> None:
         self._loose_looks = 0
         self._is_lost = self._is_cut = False
 
     def look(self, session: "Session") -> None:
-        """Report a database that is lost or back, and a recording that has ended."""
+        """Report the loss and the return of the database, and the end of the recording."""
         lost = session.database_lost
         if lost is not None and not self._is_lost:
             render.note(f"{lost}; until then no force is felt")
@@ -176,7 +176,7 @@ class Notes:
             self._is_cut = True
 
     def look_for_objects(self, session: "Session") -> None:
-        """Report that the tool lies in an object; names may come a look later than the fact."""
+        """Report a tool inside an object; the object's name may arrive one call later."""
         if self._is_lost:  # nothing is known
             return
         if session.is_loose:
@@ -194,7 +194,7 @@ class Notes:
 
 
 def _exceptional_facts(report: "Report") -> Facts:
-    """What most sessions have not: missing cells at the start, bad readings, outages, a standby."""
+    """Rare events: missing cells at the start, bad readings, outages, a standby."""
     facts: Facts = []
     cache = report.cache
     if not report.is_warm:
@@ -220,12 +220,12 @@ def _recording_text(report: "Report", recording: str) -> str:
 
 
 def _in_objects(cells: "ResidentCells", ids: Sequence[int]) -> str:
-    """The names of the objects that a tool lies in, for a sentence."""
+    """Names of the objects around a tool, for a sentence."""
     return _names_after(cells, ids).removeprefix(": ") or "an object"
 
 
 def _names_after(cells: "ResidentCells", ids: Sequence[int]) -> str:
-    """A colon and names of objects, '' for none; ids of new ones while the database is lost."""
+    """Colon and names of objects, '' for none; ids of new ones while the database is lost."""
     import hapticdb
     from hapticdb.errors import DatabaseError
 

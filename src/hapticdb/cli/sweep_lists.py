@@ -1,4 +1,4 @@
-"""Sweeps as they are asked for, and files that list many of them."""
+"""Requests for sweeps, and CSV files of many requests."""
 
 import csv
 import io
@@ -12,12 +12,12 @@ from hapticdb.units import length_of
 
 COLUMNS = ("part", "tool", "path", "where", "exclude", "contact")
 BETWEEN = ";"
-"""Between several words in a cell."""
+"""Separator of words in a cell."""
 _HINT = "give a header with part or tool, and path; and if wanted where, exclude, contact"
 
 
 class Asked(NamedTuple):
-    """One sweep, as given; contact : metres; line : in a file of sweeps, or empty."""
+    """Request for a sweep; contact : metres; line : of a file of sweeps, or empty."""
 
     tool: str | None
     part: list[str]
@@ -29,13 +29,13 @@ class Asked(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What moves, as it was asked for."""
+        """File of the tool, or words of the parts, as given."""
         return self.tool or f"{BETWEEN} ".join(self.part)
 
 
 @contextmanager
 def naming(line: str) -> Iterator[None]:
-    """Put a line's place before what is wrong with it."""
+    """Prefix errors of the block with the line of a file of sweeps."""
     try:
         yield
     except (FileError, ObjectNotFoundError, UsageError) as error:
@@ -45,7 +45,7 @@ def naming(line: str) -> Iterator[None]:
 
 
 def read_sweeps(path: str, given: Asked) -> list[Asked]:
-    """Sweeps of a CSV file, at least one; what a line does not say is as `given`."""
+    """Sweeps of a CSV file, at least one; empty or missing cells have the values of `given`."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -66,7 +66,7 @@ def read_sweeps(path: str, given: Asked) -> list[Asked]:
 
 
 def _asked(row: dict[str, str | None], given: Asked, line: str) -> Asked:
-    """The sweep of a row."""
+    """Sweep of a row."""
     if None in row or None in row.values():
         raise FileError(f"--batch {line}: it has more or fewer cells than the header")
     cells = {name: (text or "").strip() for name, text in row.items()}

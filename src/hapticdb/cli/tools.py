@@ -1,4 +1,4 @@
-"""The tool that a file holds."""
+"""Tools read from files, with notes on defects and doubtful sizes."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from hapticdb.query.law import LawName
 
 LIKELY = ("mm", "in", "cm", "um", "ft")
-"""Units that a tool may be in which is no good size in metres, the likeliest first."""
+"""Likely units of a tool with an implausible size in metres, the likeliest first."""
 
 
 @dataclass(frozen=True)
 class ToolOptions:
-    """The options that say which tool feels, and where its points are."""
+    """Options of the tool, and of the points on its surface."""
 
     tool: str
     tool_unit: UnitName | None = None
@@ -30,7 +30,7 @@ class ToolOptions:
     conservative: bool = False
 
     def made(self, env: "Environment", law: "LawName", left_out: Iterable[int]) -> "Tool":
-        """The tool, its points where contact begins under a law."""
+        """Tool with points inset by the law's onset of contact; on its surface if conservative."""
         from hapticdb.query.law import inset_of
 
         inset = 0.0 if self.conservative else inset_of(env.grid.voxel_size, law)
@@ -48,10 +48,10 @@ def tool_of(
     *,
     has_surface: bool = False,
 ) -> "Tool":
-    """Tool of a file, its defects told; --points and --seed as they were given.
+    """Tool of a file, with notes on its defects; points, seed : as given, None if not.
 
-    inset : how far its points are drawn inward, metres; a saved shell stays as it was saved;
-    has_surface : whether its triangles are wanted, so that the file is read in any case.
+    inset : inward offset of its points, metres, without effect on a saved shell; has_surface :
+    whether its triangles are required, so the file is read and the cache bypassed.
     """
     if tool.lower().endswith(".npz") and (points is not None or seed is not None):
         raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
@@ -77,7 +77,7 @@ def tool_of(
 def warn_of_size(env: "Environment", tool: "Tool", left_out: Iterable[int]) -> None:
     """Note a tool longer than the scene, or shorter than a voxel: its unit may be wrong.
 
-    Lengths are the longest sides of boxes. A unit that a person or the file gave is believed.
+    Lengths are the longest sides of AABBs. A unit given by the user or the file is trusted.
     """
     import numpy as np
 
@@ -101,7 +101,7 @@ def warn_of_size(env: "Environment", tool: "Tool", left_out: Iterable[int]) -> N
 
 
 def shell_text(shell: "PointShell") -> str:
-    """Say of a shell how many points it has, and how far they are drawn in."""
+    """Number of a shell's points and their inset, in words."""
     points, deepest = render.counted(len(shell), "point"), float(shell.inset.max())
     if deepest == 0.0:
         return f"{points}, on the surface"
@@ -111,7 +111,7 @@ def shell_text(shell: "PointShell") -> str:
 
 
 def shell_record(shell: "PointShell") -> dict[str, object]:
-    """Put the same in JSON."""
+    """Number of a shell's points and the range of their insets, metres, for JSON."""
     return {
         "points": len(shell),
         "inset": {"least": float(shell.inset.min()), "greatest": float(shell.inset.max())},

@@ -9,9 +9,9 @@ from hapticdb.units import NAMES, length_of
 
 MIB = 1 << 20
 LARGEST_MIB = 1e6
-"""Largest size that an option takes, MiB: a typing error beyond it is refused."""
+"""Largest size of an option, MiB; a larger one is refused as a typing error."""
 SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
-"""A size as an option takes it; a number without a unit is MiB."""
+"""Size of an option; a number without a unit is MiB."""
 
 
 class Point(NamedTuple):
@@ -23,7 +23,7 @@ class Point(NamedTuple):
 
 
 def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
-    """Finite numbers of an option, separated by commas or blanks; `example` is what to give."""
+    """Finite numbers of an option, separated by commas or blanks; `example` : for the error."""
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -46,14 +46,14 @@ def point_of(text: str, unit: str) -> Point:
 
 
 def budget_bytes(mib: float) -> int:
-    """Bytes of ``--budget``, which is given in MiB."""
+    """Bytes of ``--budget``, given in MiB."""
     if not 1.0 <= mib <= LARGEST_MIB:
         raise UsageError(f"--budget {mib}: give MiB, 1 to a million")
     return int(mib * MIB)
 
 
 def size_bytes(text: str, option: str) -> int:
-    """Bytes of a size that is given in MiB, or with its unit, such as ``4GiB``."""
+    """Bytes of a size in MiB, or with its own unit, such as ``4GiB``."""
     match = SIZE.fullmatch(text.strip())
     unit = (match[2] or "M")[0].upper() if match else "M"
     mib = float(match[1]) * (1024.0 if unit == "G" else 1.0) if match else 0.0

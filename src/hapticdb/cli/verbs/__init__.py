@@ -1,1 +1,1 @@
-"""The commands, one module for a few."""
+"""The verbs of the command line, one to three a module."""

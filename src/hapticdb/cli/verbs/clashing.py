@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from hapticdb.exact.moving_clash import Meeting
 
 MOST_ROWS = 20
-"""Rows of the table; further ones are counted below it."""
+"""Rows of the table of groups or pairs; further ones are counted below it."""
 NOT_DECIDED = 3
-"""Exit code where nothing was found, but not all pairs were looked at."""
+"""Exit code of a search without a clash, but with pairs not yet measured."""
 PAIRS = (
     "a", "a_name", "b", "b_name", "kind", "at_least", "at_most", "places", "status", "because",
     "rule", "volume", "group",
@@ -71,7 +71,7 @@ Example: hapticdb clashes car.db --of 'wheel*' --within 2
 
 @dataclass(frozen=True)
 class PairOptions:
-    """The options that say which pairs are looked for."""
+    """Options of the search for pairs."""
 
     within: float = 1e-3
     contact: float = 5e-5
@@ -84,7 +84,7 @@ class PairOptions:
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
-        """Kinds of --kind; UsageError."""
+        """Kinds of ``--kind``; UsageError for an unknown one."""
         names = self.kind or ()
         for name in names:
             if name not in REPORTED:
@@ -94,7 +94,7 @@ class PairOptions:
 
 @dataclass(frozen=True)
 class RuleOptions:
-    """The options that say what is meant, and that choose among what is found."""
+    """Options of intended pairs: rules, acceptance; and of the choice of results."""
 
     accept: tuple[str, str] | None = None
     because: str | None = None
@@ -107,7 +107,7 @@ class RuleOptions:
 
 @dataclass(frozen=True)
 class TurnOptions:
-    """The options of a motion."""
+    """Options of a motion."""
 
     poses: str | None = None
     turn: str | None = None
@@ -136,7 +136,7 @@ class _Output(TableOutput):
 def clashes(
     url: str, *, pairs: PairOptions, meant: RuleOptions, motion: TurnOptions, output: _Output
 ) -> None:
-    """Find every pair of objects that are near; the help text is `HELP`."""
+    """Find all pairs of near objects; the help text is `HELP`."""
     has_reports, has_rules = any(output.reports.values()), bool(meant.rules or meant.rule)
     accept, because, kinds = meant.accept, meant.because, pairs.kinds
     if because is not None and (output.csv or has_reports or (accept and has_rules)):
@@ -177,7 +177,7 @@ def clashes(
 
 
 class _Told(NamedTuple):
-    """What is said of a search; ids : of the groups of pairs of object ids."""
+    """Printed results of a search; ids : of groups, by pairs of object ids."""
 
     found: "Clashes"
     pairs: "list[Clash]"
@@ -188,7 +188,7 @@ class _Told(NamedTuple):
     def of(
         cls, env: "Environment", found: "Clashes", kinds: tuple[Kind, ...], group: str | None
     ) -> "_Told":
-        """Pairs of some kinds, or of one group; UsageError where there is no such group."""
+        """Pairs of some kinds, or of one group; UsageError for an unknown group."""
         from hapticdb.clashes.groups import groups_of
 
         pairs = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
@@ -202,7 +202,7 @@ class _Told(NamedTuple):
         return cls(found, pairs, groups, ids)
 
     def accept(self, env: "Environment", because: str, output: _Output) -> int:
-        """Accept the pairs, or take it back; returns the exit code."""
+        """Accept the pairs, or revoke that if the reason is empty; returns the exit code."""
         from hapticdb.clashes.run import accept_pairs
 
         pairs = [(one.a, one.b) for one in self.pairs]
@@ -210,7 +210,7 @@ class _Told(NamedTuple):
         return _say_accepted(pairs, because, output)
 
     def say(self, url: str, table: CsvWriter | None, output: _Output, *, is_grouped: bool) -> None:
-        """Print groups or pairs, and what rules reach."""
+        """Print groups or pairs, and the reach of the rules."""
         if table or output.json:
             ids = self.ids
             told = (plain(one) | {"group": ids.get((one.a, one.b))} for one in self.pairs)
@@ -227,7 +227,7 @@ class _Told(NamedTuple):
 
 
 def _moved(url: str, pairs: PairOptions, motion: TurnOptions, output: _Output) -> int:
-    """Print when parts that move meet others; returns the exit code."""
+    """Print the meetings of moving parts with others; returns the exit code."""
     from hapticdb.clashes.result import ASKED
 
     kinds = pairs.kinds
@@ -245,7 +245,7 @@ def _moved(url: str, pairs: PairOptions, motion: TurnOptions, output: _Output) -
 
 
 def _meetings(url: str, pairs: PairOptions, motion: TurnOptions) -> "list[Meeting]":
-    """When parts that move meet others: numbers of poses, or degrees."""
+    """Meetings of moving parts with others, as intervals of pose numbers or degrees."""
     from hapticdb.exact.moving_clash import find_meetings, hinge
     from hapticdb.poses import read_poses
     from hapticdb.store.attributes import scene_bounds
@@ -301,7 +301,7 @@ def _say_accepted(pairs: list[tuple[int, int]], because: str, output: _Output) -
 
 
 def _show_groups(groups: "list[Group]") -> None:
-    """Print the gravest open groups, and how many are closed."""
+    """Print the gravest open groups, and the number of closed ones."""
     shown = [one for one in groups if one.is_open]
     rows = [
         (one.id, one.kind, f"{len(one.pairs):,}", f"{one.n_parts:,}", one.length_text(),
@@ -336,7 +336,7 @@ def _show_pairs(told: "list[Clash]") -> None:
 
 
 def _show_facts(found: "Clashes", groups: "list[Group]") -> None:
-    """Print what each rule reaches, and how many groups and pairs there are of each kind."""
+    """Print the reach of each rule, and the numbers of groups and pairs of each kind."""
     from hapticdb.clashes.rules import rule_text
 
     reached = [

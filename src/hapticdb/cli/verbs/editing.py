@@ -1,4 +1,4 @@
-"""The verbs that edit an environment: move, remove."""
+"""Verbs for editing an environment: move, remove."""
 
 from hapticdb.cli.choosing import chosen
 from hapticdb.cli.emit import Output
@@ -16,11 +16,11 @@ def move(
     matrix: str | None = None,
     output: Output,
 ) -> None:
-    """Place objects anew.
+    """Move objects to a new place.
 
-    --translate shifts all objects that are chosen in one transaction: all or none of
-    them, whatever ends the command; --matrix places one object. 'hapticdb objects
-    --help' says how names choose objects.
+    --translate shifts all chosen objects in one transaction: all or none of them
+    move, even if the command is interrupted; --matrix places one object. 'hapticdb
+    objects --help' explains how to choose objects.
 
     Example: hapticdb move car.db 17 --translate 0,0,0.25
 
@@ -55,7 +55,7 @@ def move(
 def remove(url: str, objects: list[str], *, output: Output) -> None:
     """Remove objects, each in a transaction of its own.
 
-    'hapticdb objects --help' says how names choose objects.
+    'hapticdb objects --help' explains how to choose objects.
 
     Example: hapticdb remove car.db 17 18
 

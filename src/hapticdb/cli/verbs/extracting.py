@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hapticdb.extraction.result import Extraction
 
 MOST_BLOCKERS = 10
-"""Rows of the table of what is in the way, and of the table of searches that failed."""
+"""Rows of the table of blockers, and of the table of failed searches."""
 
 HELP = f"""Search a path on which parts come out, judged by a sweep of their surfaces.
 
@@ -59,7 +59,7 @@ Example: hapticdb extract car.db body/hood --path out.csv
 
 @dataclass(frozen=True)
 class OrderOptions:
-    """The options of a search that takes off what blocks the parts."""
+    """Options of a disassembly: a search with removal of the parts' blockers."""
 
     disassemble: bool = False
     depth: int | None = None
@@ -73,7 +73,7 @@ class OrderOptions:
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """The options of every search."""
+    """Options common to all searches."""
 
     seconds: float | None = None
     seed: int = 0
@@ -102,7 +102,7 @@ class _Output(Output):
         check_view()
 
     def files(self, n_steps: int | None) -> list[str]:
-        """Files of the path, or of the steps of an order: ``out-1.csv`` of ``out.csv``."""
+        """Files of the path, or of a disassembly's steps: ``out-1.csv`` for ``out.csv``."""
         if self.path is None or n_steps is None:
             return [self.path] if self.path else []
         path = Path(self.path)
@@ -121,7 +121,7 @@ def extract(
     budget: float = 256.0,
     output: _Output,
 ) -> None:
-    """Search a path on which parts come out; the help text is `HELP`."""
+    """Search a removal path of parts; the help text is `HELP`."""
     import hapticdb
     from hapticdb.extraction.disassembly import disassemble
     from hapticdb.extraction.run import extract as search_way
@@ -152,7 +152,7 @@ def extract(
 
 
 def _goal(to: str) -> "NDArray[np.float64]":
-    """The pose (4, 4) that --to names: numbers in millimetres, or a file."""
+    """Pose (4, 4) of --to, metres: given as numbers, millimetres, or as a file, metres."""
     import numpy as np
 
     from hapticdb.poses import pose_of_row, read_poses
@@ -176,9 +176,9 @@ def _report(
     env: "Environment", found: "Extraction | Disassembly",
     steps: "Sequence[tuple[Extraction, Sequence[int]]]", output: _Output,
 ) -> None:  # fmt: skip
-    """Write paths, print the verdict, and draw the animation if it was asked for.
+    """Write paths, print the verdict, and write the animation on request.
 
-    steps : those that were found, with the ids of what is not felt in each.
+    steps : results with a path, each with the ids of the objects excluded from it.
     """
     from hapticdb.extraction.result import Extraction
     from hapticdb.extraction.verdict import disassembly_line, extraction_line
@@ -207,7 +207,7 @@ def _report(
 
 
 def _show(found: "Extraction") -> list[tuple[str, str]]:
-    """Print what is in the way; returns the figures of the search."""
+    """Print the blockers; returns the figures of the search."""
     from hapticdb.exact.report import names_of
 
     if found.way is None and found.blockers:

@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from hapticdb.session.session import Session
 
 LOOK_EVERY, OBJECTS_EVERY = 0.1, 3
-"""Seconds between two looks at the session: how late a lost database is reported, or the end of its
-recording; and looks between two whether the tool lies in an object, which may last a moment."""
+"""Seconds between two polls of the session, the delay of the notes on a lost database or an ended
+recording; and polls between two checks for a tool inside an object: it may be there briefly."""
 CONTACT_STIFFNESS = 1000.0
-"""Stiffness of a contact, rendered directly, unless --stiffness is given, N/m."""
+"""Default stiffness of a contact with direct rendering, N/m."""
 
 
 @dataclass(frozen=True)
 class ForceOptions:
-    """The options of how contacts become the force on the hand."""
+    """Options of the force on the hand: law, coupling and device limits."""
 
     law: LawName | None = None
     rendering: RenderingName | None = None
@@ -48,13 +48,13 @@ class ForceOptions:
 
     @property
     def profile(self) -> "DeviceProfile | None":
-        """What the device renders; None: what it says itself."""
+        """Profile of the device by ``--device-profile``; None for the device's own."""
         from hapticdb.devices.profiles import profile_named
 
         return None if self.device_profile is None else profile_named(self.device_profile)
 
     def settled(self, rendering: "Rendering") -> "tuple[ForceLaw | None, Coupling]":
-        """Law and coupling of a session; a UsageError where options contradict."""
+        """Law and coupling of a session; UsageError for contradictory options."""
         from hapticdb.query.law import law_named
         from hapticdb.session.coupling import Coupling
 
@@ -70,14 +70,14 @@ class ForceOptions:
 
 @dataclass(frozen=True)
 class RecordOptions:
-    """The options of a recording."""
+    """Options of a recording."""
 
     record: str | None = None
     replace: bool = False
     record_limit: str | None = None
 
     def settled(self) -> dict[str, Any]:
-        """Arguments of a session; refuses options of a recording where there is none."""
+        """Arguments of a session; UsageError for options of a recording without one."""
         from hapticdb.recording.file import DEFAULT_LIMIT
 
         limit = self.record_limit
@@ -91,7 +91,7 @@ class RecordOptions:
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """The options of the loop, and of the processor or GPU that runs it."""
+    """Options of the loop, and of its processor or GPU."""
 
     rate: float = 1000.0
     seconds: float | None = None
@@ -112,7 +112,7 @@ def feel(
     no_baseline: bool = False,
     output: Output,
 ) -> None:
-    """Feel an environment in real time with a device; report how well frames kept their time.
+    """Feel an environment in real time with a device, then report the timing of the frames.
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
@@ -144,7 +144,7 @@ def feel(
 def _begun(
     begin: "partial[Session]", url: str, budget_bytes: int, felt: Felt, law: LawName | None
 ) -> "Iterator[Session]":
-    """Begin a session; its resident cells have distances where the law reads them."""
+    """Begin a session; its resident cells have distances if the law reads them."""
     is_measured = begin.keywords["has_baseline"]
     doing = "measuring an empty loop, then starting" if is_measured else "starting"
     with ExitStack() as held:
@@ -181,9 +181,9 @@ def _begin_loop(force: ForceOptions, loop: LoopOptions) -> "Rendering":
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:
-    """Leave with the exit code of the signal that ended the session.
+    """Exit with the code of the signal that ended the session.
 
-    1 if the database was lost at its end, or so long that frames had no force.
+    Without a signal: 1 if the database was lost at the end, or so long that frames had no force.
     """
     if signal.SIGTERM in signals:
         render.note(f"ended by SIGTERM after {report.loop.seconds:.3g} s")
@@ -195,7 +195,7 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
 
 
 def _waited_for(session: "Session", stiffness: float | None, seconds: float | None) -> "Report":
-    """Wait for a session's end; what a person should know at once is told at once."""
+    """Wait for a session's end; urgent notes are printed meanwhile."""
     lowered = getattr(session.coupling, "lowered", None)
     if stiffness is not None and lowered is not None:
         render.note(lowered)

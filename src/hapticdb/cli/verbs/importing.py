@@ -23,13 +23,14 @@ if TYPE_CHECKING:
     from hapticdb.ingest.files import FileReport, ImportOptions
 
 COARSE, FINE_ENOUGH, TINY = 1.0, 0.5, 1e-8
-"""Voxels, metres: larger ones are told, with the bits that make them fine enough, and tiny ones."""
+"""Voxel sizes, metres: a note reports those above `COARSE`, with the bits for `FINE_ENOUGH`, and
+those below `TINY`."""
 MOST_BITS = 21
 
 
 @dataclass(frozen=True)
 class NewGridOptions:
-    """The options of a new environment's grid and rows."""
+    """Options of a new environment's grid and rows."""
 
     bits: int | None = None
     voxel_size: float | None = None
@@ -43,7 +44,7 @@ class NewGridOptions:
 
 @dataclass(frozen=True)
 class ReadingOptions:
-    """The options of how files are read."""
+    """Options of reading files."""
 
     unit: UnitName | None = None
     chord: float | None = None
@@ -64,17 +65,17 @@ def import_(
     keep_removed: bool = False,
     output: Output,
 ) -> None:
-    """Import files into an environment, which is made when it does not exist.
+    """Import files into an environment; a missing environment is created.
 
-    Every part becomes an object, in a transaction of its own: run the same
-    command again to go on with what was interrupted. A file that cannot be
-    used is named and skipped, and the others go in. Parts that were removed
-    come in again, and are counted, unless --keep-removed leaves them out.
+    Every part becomes an object, in a transaction of its own: after an
+    interruption, run the same command again to continue. An unusable file is
+    named and skipped, and the others are imported. Parts that were removed
+    are imported again, and counted, unless --keep-removed omits them.
 
-    To an environment that exists, files are added. With --replace it holds
-    what they hold now: objects of another geometry, place or unit are replaced
-    under their ids, moved ones go back, and those that the file lacks are
-    removed; each in a transaction, so that an interruption loses none.
+    Files are added to an existing environment. With --replace it follows the
+    files: objects of another geometry, place or unit are replaced under
+    their ids, moved ones go back, and those missing from the file are
+    removed; each in a transaction, so an interruption loses none.
 
     Example: hapticdb import car.db car.glb --bits 11 --extent 1.6
 
@@ -123,7 +124,7 @@ def _imported(url: str, files: Sequence[str], options: "ImportOptions") -> "list
 def _tell(
     url: str, files: Sequence[str], reports: "Sequence[FileReport]", elapsed: float, output: Output
 ) -> None:
-    """Print what became of each file, and what the environment holds now."""
+    """Print the result of each file, and the environment's contents."""
     from hapticdb.store.attributes import scene_bounds
     from hapticdb.store.connect import open_store
 
@@ -150,7 +151,7 @@ def _tell(
 
 
 def _warn_of_voxels(size: float, bits: int) -> None:
-    """Note voxels that are too coarse or too fine for parts, with the option that helps."""
+    """Note voxels too coarse or too fine for parts, with the option to change."""
     if size > COARSE and bits < MOST_BITS:
         more = min(bits + ceil(log2(size / FINE_ENOUGH)), MOST_BITS)
         finer = length_text(size / 2 ** (more - bits))
@@ -165,7 +166,7 @@ def _record(report: "FileReport") -> dict[str, Any]:
 
 
 def _lines(file: str, report: "FileReport") -> list[str]:
-    """What became of a file, and what a person should know of it."""
+    """Result of a file and remarks on it, a line each."""
     if report.status == "complete":
         there = render.counted(report.present, "object")
         line = f"{file}: complete already ({there}), nothing to do"

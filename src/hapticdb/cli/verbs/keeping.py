@@ -1,4 +1,4 @@
-"""The verbs that keep an environment: check, backup, grant."""
+"""Verbs for maintenance: check, backup, grant."""
 
 from functools import partial
 from typing import TYPE_CHECKING
@@ -22,11 +22,11 @@ MEANINGS: dict[RightName, str] = {
 
 
 def check(url: str, *, repair: bool = False, output: Output) -> None:
-    """Read all of an environment and say what is wrong with it, a line each.
+    """Check a whole environment for damage, and print each defect on a line.
 
     The structure, rows, objects, surfaces, pairs and the log of changes are
-    compared. The exit code is 0 when it is sound, 1 when it is damaged, 2 when it
-    cannot be read. With --repair it says what is still wrong when rows are mended.
+    compared. The exit code is 0 if the environment is sound, 1 if it is damaged, 2
+    if it cannot be read. --repair mends rows, then prints the remaining defects.
 
     Example: hapticdb check car.db
     """
@@ -75,13 +75,13 @@ def _checked(report: "CheckReport") -> str:
 
 
 def backup(url: str, file: str, *, replace: bool = False, output: Output) -> None:
-    """Copy an environment whole into a file, while others go on working with it.
+    """Copy a whole SQLite environment into a file, while others work with it.
 
-    The copy holds the environment as of one moment, can be opened as any
-    other, and appears when it is whole. Copying the file by other means
-    leaves out what is still in its log. --replace puts a copy back in an
-    environment's place, which nobody may have open. On PostgreSQL pg_dump
-    and pg_restore do this.
+    The copy has the state of one moment, opens like any environment, and
+    appears only when it is complete. Other ways to copy the file miss the
+    changes in its log. --replace puts a copy back in place of an
+    environment; nobody may have that one open. On PostgreSQL use pg_dump
+    and pg_restore.
 
     Example: hapticdb backup car.db backups/monday.db
     """
@@ -97,9 +97,9 @@ def backup(url: str, file: str, *, replace: bool = False, output: Output) -> Non
 
 
 def grant(url: str, role: str, *, as_: RightName, output: Output) -> None:
-    """Say what a role may do with an environment on PostgreSQL; the server holds it to that.
+    """Set the rights of a role in an environment on PostgreSQL; the server enforces them.
 
-    A viewer reads and touches; a toucher also keeps cost figures; an editor
+    A viewer reads and touches; a toucher also stores cost figures; an editor
     also imports, moves and removes objects; nobody has no right. The grid
     and the rights belong to the owner, who made the environment.
 

@@ -1,4 +1,4 @@
-"""The verbs that look at an environment: info, objects."""
+"""Verbs for the contents of an environment: info, objects."""
 
 import sys
 from contextlib import closing, suppress
@@ -18,30 +18,30 @@ if TYPE_CHECKING:
     from hapticdb.store.base import Object, Store
 
 PAGE = 40
-"""Objects that a terminal shows, unless asked otherwise."""
+"""Default number of objects on a terminal."""
 MEANINGS = {
     "statement": "a statement of ranges, without what it reads",
     "descent": "each range of a statement: a descent of the index",
     "block": "each leaf block scanned in the engine",
     "row": "each row handed to the client",
 }
-"""Figures of a cost model that are times, microseconds, and what each is the time of."""
+"""Times of a cost model, microseconds, with their meanings."""
 RATIOS = ("rows_per_block", "caution", "distances")
-"""Figures of a cost model that are ratios, and not times."""
+"""Figures of a cost model without a unit: ratios."""
 SOURCES = {
     "server statistics": "the server's own statistics",
     "kept": "computed and kept",
     "computed": "computed when needed",
 }
-"""Where the statistics of the keys come from, in words."""
+"""Sources of the statistics of the keys, in words."""
 
 
 def info(url: str, *, calibrate: bool = False, cold: bool = False, output: Output) -> None:
     """Show an environment's engine, grid, layout, scene, size and statistics.
 
-    With --calibrate, what statements, descents and rows cost is measured, and
-    the statistics are renewed. The figures are kept in the environment; the
-    strategies cbgroup and auto decide by them.
+    --calibrate measures the cost of statements, index descents and rows, and
+    renews the statistics. The figures are stored in the environment; the
+    strategies cbgroup and auto use them.
 
     Example: hapticdb info car.db --calibrate
     """
@@ -50,7 +50,7 @@ def info(url: str, *, calibrate: bool = False, cold: bool = False, output: Outpu
     if cold and not calibrate:
         raise UsageError("--cold belongs to --calibrate: give it, too")
     costs, is_kept = _measured(url, cold=cold) if calibrate else (None, False)
-    # the store: an Environment brings what touches and imports, a tenth of a second
+    # the store alone: Environment also loads the code of touches and imports, 0.1 s
     with closing(open_store(url, read_only=True)) as store:
         told, words = _overview(store)
     if costs is not None:
@@ -61,7 +61,7 @@ def info(url: str, *, calibrate: bool = False, cold: bool = False, output: Outpu
 
 
 def _overview(store: "Store") -> tuple[dict[str, Any], list[tuple[str, str]]]:
-    """What `info` tells of an environment, as JSON and in words."""
+    """Facts of an environment for `info`, as JSON and in words."""
     from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
     from hapticdb.store.attributes import scene_bounds
     from hapticdb.store.engines import MayLag
@@ -113,14 +113,14 @@ def objects(
 ) -> None:
     """List the objects of an environment.
 
-    Verbs take objects by id, by name, by pattern and by attribute. A name is a path, such as
+    Verbs accept objects by id, by name, by pattern and by attribute. A name is a path, such as
     body/door/handle. A name without / fits any element of a path, a name with /
     the path from its start. The name of a sub-assembly means all objects below it.
     In a pattern * stands for anything, ? for one character, [ab] for a or b;
-    case counts. attribute=value chooses the objects that have that attribute; the
-    value may be a pattern, and outer.inner=value names one inside another. A word
-    with = that fits the name of an object chooses that name. A number is an id, or
-    a name where no object has that id; name=3 is a name.
+    case counts. attribute=value chooses the objects with this attribute; the
+    value may be a pattern, and outer.inner=value names a nested attribute. A word
+    with = is a name if an object has this name. A number is an id, or
+    a name if no object has this id; name=3 is a name.
 
     Example: hapticdb objects car.db
 
@@ -166,7 +166,7 @@ def size_text(obj: "Object") -> str:
 
 
 def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
-    """Costs as measured now, and whether they are kept; renews the statistics, too, if it may."""
+    """Costs measured now, and whether they are stored; renews the statistics if permitted."""
     with opened_to_keep(url) as env:
         is_kept = not env.store.is_read_only
         if is_kept:

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def distance(url: str, a: str, b: str, *, output: Output) -> None:
-    """Measure the least distance of the surfaces of two objects, and say where it is.
+    """Measure the distance between the surfaces of two objects, with the nearest points.
 
-    Where A or B are several objects, the two nearest ones are measured. Where
-    surfaces meet, 'hapticdb clashes --of A --against B' says how deep.
+    If A or B are several objects, the two nearest ones are measured. If
+    surfaces meet, 'hapticdb clashes --of A --against B' measures the depth.
 
     Example: hapticdb distance car.db body/hood body/windscreen
     """

@@ -1,4 +1,4 @@
-"""The verbs that copy and compare environments: copy, diff."""
+"""Verbs for two environments: copy, diff."""
 
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -21,9 +21,9 @@ KINDS = {
     "moved": "another place", "attributes": "other attributes", "boxes": "another box",
     "voxels": "other voxels", "distances": "other distances",
 }  # fmt: skip
-"""Fields of a `Difference`, the most important first, and what they say of an object."""
+"""Fields of a `Difference`, the most important first, with their words for an object."""
 MOST_LINES = 20
-"""Differences that are listed; more are counted."""
+"""Rows of the table of differences; further ones are counted."""
 
 
 def copy(
@@ -36,9 +36,9 @@ def copy(
 ) -> None:
     """Copy an environment, also to another engine, layout or curve.
 
-    Every object goes over in a transaction of its own, with its id: run the
-    same command again to go on with what was interrupted. What is edited
-    meanwhile is not copied.
+    Every object is copied in a transaction of its own, with its id: after an
+    interruption, run the same command again to continue. Edits made meanwhile
+    are not copied.
 
     Example: hapticdb copy car.db hilbert.db --curve hilbert
     """
@@ -70,12 +70,12 @@ def _copied(report: "CopyReport") -> str:
 
 
 def diff(a: str, b: str, *, output: Output) -> None:
-    """Say whether two environments hold the same, and what differs.
+    """Compare two environments, and list their differences.
 
-    Objects are the same by file and name. Their surfaces, places, attributes,
-    boxes and rows are compared; rows only where surface and place are the same,
-    and distances where both have them. The exit code is 0 when they hold the
-    same, 1 when they differ. Ids, engine, layout and curve make no difference.
+    Objects are paired by file and name. Their surfaces, places, attributes,
+    boxes and rows are compared; rows only if surface and place are the same,
+    and distances if both have them. The exit code is 0 if the environments
+    are equal, 1 if they differ. Ids, engine, layout and curve do not matter.
 
     Example: hapticdb diff car.db hilbert.db
     """

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from hapticdb.recording.file import Recording
 
 PIECE = 4096
-"""Frames that are written to CSV at once. Larger: more memory."""
+"""Frames of a block of CSV. Larger: more memory."""
 FRAMES = (
     "time", "dt", "lateness", "elapsed", "hand", "hand_velocity", "tool", "applied", "spring",
     "hits", "contacts", "unknown", "deepest", "revision", "buttons", "state",
@@ -20,12 +20,12 @@ FRAMES = (
 
 
 def replay(recording: str, url: str | None = None, *, output: TableOutput) -> None:
-    """Run a recorded session again, and say whether tool, wrench and contacts are equal.
+    """Run a recorded session again, and compare tool, wrench and contacts.
 
-    Ends with exit code 0 when all frames are equal bit for bit, 1 when some
-    differ or there was none to compare; the first one is named with the
-    reason. With --csv, the recorded frames are written and nothing is
-    compared; no environment is needed.
+    The exit code is 0 if all frames are equal bit for bit, 1 if some
+    differ or there was none to compare; the first difference is printed
+    with its reason. --csv writes the recorded frames and compares nothing;
+    it needs no environment.
 
     Example: hapticdb replay session.hdbrec car.db
     """
@@ -58,7 +58,7 @@ def replay(recording: str, url: str | None = None, *, output: TableOutput) -> No
 
 
 def _write_frames(session: "Recording", target: str) -> None:
-    """Write recorded frames as CSV, piece by piece; single precision as it is read back."""
+    """Write recorded frames as CSV, block by block; single-precision numbers round-trip."""
     frames = session.frames()
     with open_csv(target, FRAMES) as table:
         assert table is not None  # noqa: S101 - a target was given

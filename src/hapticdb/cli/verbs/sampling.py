@@ -1,4 +1,4 @@
-"""The verbs that need no data of the user's: sample, demo."""
+"""Verbs without input: sample, demo."""
 
 from collections import Counter
 from pathlib import Path
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 def sample(folder: Path, *, frames: int = 1000) -> None:
-    """Write the sample: car.glb, wrench.stl, path.csv, rules.toml.
+    """Write sample files: car.glb, wrench.stl, path.csv, rules.toml.
 
-    The path slides the wrench over the car; the rules leave one clash of its parts.
+    The path slides the wrench over the car; the rules leave one clash of its parts open.
 
     Example: hapticdb sample sample
     """
@@ -28,7 +28,7 @@ def sample(folder: Path, *, frames: int = 1000) -> None:
 def demo(
     folder: Path = Path("demo"), *, bits: int = 10, frames: int = 1000, points: int = 300
 ) -> None:
-    """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
+    """Make a car, import it, slide a tool over it by every strategy, and draw the contacts.
 
     Example: hapticdb demo demo --bits 11
     """

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PageOptions:
-    """The options of what a page shows, and for how long."""
+    """Options of a page's contents and duration."""
 
     tool: list[str] | None = None
     rendering: RenderingName | None = None
@@ -31,7 +31,7 @@ class PageOptions:
     def serving(
         self, url: str, tokens: "dict[str, Role]", role_urls: Sequence[str] = ()
     ) -> "Serving":
-        """What to serve; refuses what is not there, and a coupling where there are no distances."""
+        """Settings of the server; UsageError for missing files, or a coupling without distances."""
         from contextlib import closing
 
         from hapticdb.server.access import Role
@@ -60,7 +60,7 @@ class PageOptions:
 
 @dataclass(frozen=True)
 class ReachOptions:
-    """The options of how a server is reached."""
+    """Options of a server's address, proxy and certificate."""
 
     host: str = "127.0.0.1"
     port: int = 0
@@ -138,14 +138,14 @@ def _check_extra() -> None:
 
 
 def _title(url: str) -> str:
-    """Title of the page: the file's name, or the environment's place without secrets."""
+    """Title of the page: the file's name, or the database's from a URL without secrets."""
     from hapticdb.store.urls import redact
 
     return f"{Path(redact(url).partition('?')[0]).stem} - hapticdb"
 
 
 def _tokens(file: str | None, *, are_made: bool) -> "dict[str, Role]":
-    """Collect the tokens of a file, and those that are made, with the role of each."""
+    """Tokens of a file, and new ones, with the role of each."""
     from hapticdb.server.access import Role, check_token, make_token
 
     tokens = {make_token(): role for role in Role} if are_made else {}
@@ -189,7 +189,7 @@ def _run(
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"--seconds {seconds:g}: give a time above 0")
     served.check(serving)
-    prepare(served.PAGE, with_kernels=False)  # loads while the server does here
+    prepare(served.PAGE, with_kernels=False)  # loads while this process loads the server
     from hapticdb.server import logs, running
 
     if not served.is_near(serving.host) and serving.certificate is None:

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
 
 MOST_OBJECTS = 20
-"""Rows of the table of what is hit or touched; the other objects are counted below it."""
+"""Rows of the table of hits and contacts; the other objects are counted below it."""
 SWEPT = (
     "what", "id", "name", "fraction", "segment", "on_tool", "on_object", "at_least", "until",
     "start", "start_at_least", "reach", "by", "gap", "verdict",
 )  # fmt: skip
-"""Keys of `sweep --csv`: a row for each object that is hit, enclosed or touched at the start, and
-one for the nearest object; `what` says which. A cell that does not belong to it is empty."""
+"""Keys of `sweep --csv`: a row for each object hit, enclosed or touched at the start, and one for
+the nearest object; `what` names the case, and cells without meaning in a case are empty."""
 
 HELP = f"""Say whether a tool or part is free on a path: what it hits, where, how near it comes.
 
@@ -73,7 +73,7 @@ Example: hapticdb sweep car.db --part 17 --path out.csv
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """The options that all sweeps of a command share."""
+    """Options common to all sweeps of a command."""
 
     about: Point | None = None
     overlap: float = 0.0
@@ -84,7 +84,7 @@ class SweepOptions:
 
 
 class _Job(NamedTuple):
-    """A sweep whose words and path are read; parts : ids of what moves."""
+    """Sweep with resolved objects and its poses; parts : ids of the moving objects."""
 
     asked: Asked
     poses: "NDArray[np.float64]"
@@ -93,7 +93,7 @@ class _Job(NamedTuple):
 
 
 class _Told(NamedTuple):
-    """A sweep's result with its tool, and the seconds that it took with the tool."""
+    """Result of a sweep with its tool; seconds : of the sweep and of making the tool."""
 
     job: _Job
     shell: "PointShell"
@@ -134,7 +134,7 @@ def sweep(
 
 
 def _check(one: Asked, tool_unit: str | None, batch: str | None, csv: str | None) -> None:
-    """Refuse options that contradict one another."""
+    """UsageError for contradictory options."""
     if batch is not None:
         given = {"--tool": one.tool, "--part": one.part, "--path": one.path, "--csv": csv}
         for name, value in given.items():
@@ -163,7 +163,7 @@ def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
 def _all_swept(
     env: "Environment", jobs: Sequence[_Job], motion: SweepOptions, output: TableOutput
 ) -> list[_Told]:
-    """Run sweeps, each told as JSON at once."""
+    """Run sweeps; JSON of each is printed at once."""
     from hapticdb.exact.report import verdict_line
 
     told = []
@@ -178,7 +178,7 @@ def _all_swept(
 
 
 def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Told:
-    """Make the tool, and move it along the path."""
+    """Make the tool, and sweep it along the path."""
     from hapticdb.exact.sweep import sweep as sweep_path
 
     asked, felt = job.asked, job.felt
@@ -206,7 +206,7 @@ def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Told:
 
 
 def _write(table: CsvWriter, found: "Swept") -> None:
-    """Write rows: what is hit, along the path; enclosed; touched at the start; the nearest."""
+    """Write rows: hits along the path, enclosed objects, contacts at the start, the nearest."""
 
     def add(what: str, part: object, **more: object) -> None:
         told: dict[str, Any] = plain(part)
@@ -236,7 +236,7 @@ def _show_batch(told: Sequence[_Told]) -> None:
 
 
 def _show(told: _Told) -> None:
-    """Print the verdict, a table of what is hit or touched, and the figures that it stands on."""
+    """Print the verdict, a table of hits and contacts, and the figures behind the verdict."""
     from hapticdb.exact.report import gap_text, percent, until_text, verdict_line
 
     found = told.found
@@ -272,7 +272,7 @@ def _show(told: _Told) -> None:
 
 
 def _gap_range(found: "Swept", text: str) -> str:
-    """The gap's bounds."""
+    """Lower and upper bound of the gap, in words."""
     if found.gap.place is None:
         return text
     return f"{text} proved, {length_text(found.gap.at_most)} measured at the nearest place"

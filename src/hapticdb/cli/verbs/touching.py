@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from hapticdb.store.base import Object
 
 MOST_TOUCHED = 8
-"""Objects in the table of those that were touched in most frames."""
+"""Rows of the table of the objects touched in most frames."""
 FEW_POSES = 500
-"""Poses of a path below which it does not pay to measure the database's costs. Measuring takes most
-of a second, and `touch` opens the environment to read, so that it could not keep the figures."""
+"""Least poses of a path for a calibration of the database's costs. It takes most of a second, and
+its figures cannot be stored, since `touch` opens the environment read-only."""
 TOUCHED = ("pose", "force", "torque", "hits", "contacts", "deepest", "touched")
 """Keys of `touch --csv`: a row for each pose."""
 CONTACTS = ("pose", "point", "place", "depth", "id", "name")
-"""Keys of `touch --contacts-csv`: a row for each contact with each object that it touches."""
+"""Keys of `touch --contacts-csv`: a row for each pair of a contact and a touched object."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def touch(
     stiffness: float = 1000.0,
     output: _Output,
 ) -> None:
-    """Touch an environment with a tool along a path: force, torque and objects of every pose.
+    """Touch an environment with a tool along a path: force, torque, objects at every pose.
 
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
@@ -93,7 +93,7 @@ def touch(
             return
         used = _strategy_of(strategy, env, len(path))
         touch_at = partial(env.touch, shell, strategy=used, maxgap=maxgap, **which)
-        touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
+        touch_at(path[0])  # compiles kernels and reads statistics, outside of the frames' times
         for index, pose in enumerate(path):
             touched = touch_at(pose)
             summary.add(touched)
@@ -107,7 +107,7 @@ def touch(
 
 
 def _path_of(poses: str, unit: UnitName | None, output: _Output) -> "NDArray[np.float64]":
-    """Poses of a CSV file, or of a .npy file for a batch; refuses what only a batch takes."""
+    """Poses of a CSV file, or of a .npy file, metres, for a batch alone; checks its GPU first."""
     from hapticdb.poses import map_poses, read_poses
 
     if output.on == "cuda":
@@ -124,7 +124,7 @@ def _path_of(poses: str, unit: UnitName | None, output: _Output) -> "NDArray[np.
 def _touch_into(
     out: Path, shell: "PointShell", pieces: "Generator[TouchBatch, None, None]"
 ) -> None:
-    """Write what is felt, piece by piece, into a file."""
+    """Write forces and contacts to a file, batch by batch."""
     import numpy as np
 
     first = n_touching = 0
@@ -141,7 +141,7 @@ def _touch_into(
 
 
 def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
-    """`array` in place of `auto` on a short path where no costs are kept, else as wanted."""
+    """Strategy of the queries: `array` instead of `auto` on a short path without stored costs."""
     from hapticdb.paper.cost_model import machine_name
 
     if wanted == "auto" and n_poses < FEW_POSES and not env.store.costs(machine_name()):
@@ -160,7 +160,7 @@ def _record(touched: "Touch") -> dict[str, Any]:
 def _contacts(
     index: int, touched: "Touch", shell: "PointShell", pose: "NDArray[np.float64]"
 ) -> list[dict[str, Any]]:
-    """Contacts, ordered by point and id; points at their places in the world."""
+    """Rows of contacts, ordered by point and id; places in the world frame."""
     depths = dict(zip(touched.contacts.tolist(), touched.contact_depths.tolist(), strict=True))
     names = {obj.id: obj.name for obj in touched.objects}
     return [
@@ -178,7 +178,7 @@ def _mean_of(numbers: "NDArray[np.float64]", noun: str) -> str:
 
 @dataclass
 class _Summary:
-    """What a path felt like, gathered frame by frame.
+    """Figures of a path, collected frame by frame.
 
     frames : force, N, torque, N m, hits and contacts; statements, ranges, rows and us of the query.
     """
@@ -189,7 +189,7 @@ class _Summary:
     objects: dict[int, "Object"] = field(default_factory=dict)
 
     def add(self, touched: "Touch") -> None:
-        """Count one frame in."""
+        """Add a frame."""
         import numpy as np
 
         force, torque = (float(np.linalg.norm(one)) for one in (touched.force, touched.torque))
@@ -200,7 +200,7 @@ class _Summary:
         self.objects |= {obj.id: obj for obj in touched.objects}
 
     def show(self, shell: "PointShell", law: str) -> None:
-        """Print it."""
+        """Print peaks, times, query counts and touched objects."""
         import numpy as np
 
         forces, torques, hits, contacts, statements, ranges, rows, elapsed = np.array(self.frames).T

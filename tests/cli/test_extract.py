@@ -69,7 +69,7 @@ def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
 def test_wrong_arguments_are_refused(
     run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused(run("extract", scene, "nut"), "PART: no object 'nut'")
+    refused(run("extract", scene, "nut"), "WORDS: no object 'nut'")
     refused(run("extract", scene), "WORDS")
     refused(run("extract", "missing.db", "box0"), "missing.db")
     refused(run("extract", scene, "box0", "--to", "0,0,1"), "--to '0,0,1'")

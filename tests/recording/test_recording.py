@@ -97,7 +97,7 @@ def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
     assert zlib.crc32(content[len(first) + 1 : rows_at]) == crc
     told = json.loads(text)
     assert (told["grid"]["curve"], told["stiffness"], told["exclude"]) == ("hilbert", 700, [2, 5])
-    assert (told["shell"]["points"], told["start"]) == (1, [0, 0, 0, 0])
+    assert (told["shell"]["points"], told["start"]) == (1, [0, 0, 0, 0, 0])
     numbers = np.frombuffer(rest[: 48 * 1 + 24], "<f8")
     assert numbers.tolist() == [0.1, 0.2, 0.3, 0, 0, 1, 0.01, 0, 0]
     row = np.dtype([(name, kind, *map(tuple, shape)) for name, kind, *shape in told["row"]])

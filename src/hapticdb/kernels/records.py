@@ -379,7 +379,6 @@ SEAT: Layout = _record(
         # written by the process of the servo loop; counts of frames by their results
         ("n_frames", "<i8"),
         ("missed", "<i8"),  # deadlines without a frame
-        ("in_time", "<i8"),  # frames done within their period
         ("hit_frames", "<i8"),
         ("contact_frames", "<i8"),
         ("unknown_frames", "<i8"),

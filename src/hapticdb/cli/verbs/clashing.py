@@ -44,16 +44,17 @@ The database keeps what is found. The next call measures only pairs of objects
 that were added, moved or replaced since, and says what is new, changed, gone or the
 same. --accept marks pairs as intended, until either part changes its shape.
 
-PairOptions are told in groups, each one finding: copies of a pair, one part against many,
-and duplicates, which are equal parts at one place. --all and --group tell pairs.
+Pairs are reported in groups, each one finding: copies of a pair, one part against
+many, and duplicates, which are equal parts at one place. The table has open groups
+alone; --all and --group list pairs.
 --rules and --rule say what is meant, what to keep apart, and what to ignore; the
 database keeps them, and the first rule that reaches a pair decides.
 
---least-volume tells the volume that two closed parts have in common, and leaves out
+--least-volume measures the volume that two closed parts have in common, and drops
 smaller ones. Of open surfaces it is not known; such pairs stay.
 
-Ctrl-C and --seconds lose nothing: the next call goes on. What was not looked
-at is told as that.
+Ctrl-C and --seconds lose nothing: the next call goes on. Pairs that were not
+measured are counted.
 
 --poses and --turn move the parts of --of together, and say in which intervals of the
 motion they meet each other object, and how deep. Where they do not is proved, as by

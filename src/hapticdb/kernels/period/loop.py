@@ -250,7 +250,6 @@ def _count_missed(stations, seats, pace):
     for n in range(stations.shape[0]):
         if stations[n].is_running:
             seat = seats[stations[n].seat]
-            seat.in_time += behind == 0
             seat.missed += behind
     pace.due += behind * pace.period
     pace.passed += 1 + behind

@@ -71,6 +71,11 @@ class Queries:
             file, points, spacing=spacing, unit=unit, seed=seed, inset=drawn
         )
 
+    def _tool_of(self, file: object) -> PointShell:
+        if not isinstance(file, str | os.PathLike):
+            raise UsageError("touch: give a tool, then one pose, or many as poses=...")
+        return self.tool(file)
+
     @property
     def _inset(self) -> float:
         return inset_of(self._store.grid.voxel_size, "distance" if self.has_distances else "plane")
@@ -142,9 +147,9 @@ class Queries:
         """
         if (pose is None) == (poses is None):
             raise UsageError("touch: give either one pose, or poses=...")
-        if isinstance(shell, str | os.PathLike):
-            shell = self.tool(shell)
-        if not isinstance(shell, PointShell) or getattr(pose, "ndim", 2) == 3:
+        if not isinstance(shell, PointShell):  # first: a test for paths takes a microsecond
+            shell = self._tool_of(shell)
+        if getattr(pose, "ndim", 2) == 3:
             raise UsageError("touch: give a tool, then one pose, or many as poses=...")
         if pose is not None:
             felt = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)

@@ -33,15 +33,15 @@ The parts that WORDS choose move together as one rigid body. Straight pulls are
 tried first: along the axes, away from contacts and along them, at random; with
 --screw then screw motions. If none leads out, a planner (OMPL, pip install ompl)
 searches a path round corners and with turns. A part is out when its bounding
-sphere is clear of the box of all that stands, or at --out. With --to, a way to a
+sphere is clear of the box of all other parts, or at --out. With --to, a path to a
 pose is searched instead.
 
 The path is written by --path as displacements from the present place, as
 'hapticdb sweep --part' takes them. The same seed gives the same path, unless
 --seconds end the search.
 
-Overlaps count if they are more than --contact and --overlap. Where no way is found,
-what blocks most of the straight pulls is named.
+Overlaps count if they are more than --contact and --overlap. If no path is found,
+the parts that block most of the straight pulls are named.
 
 With --disassemble, what blocks the parts is taken off first, each object alone
 and on a path that is proved; --keep names what stays. Each step has a file of its

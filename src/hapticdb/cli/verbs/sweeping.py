@@ -38,13 +38,13 @@ SWEPT = (
 """Keys of `sweep --csv`: a row for each object hit, enclosed or touched at the start, and one for
 the nearest object; `what` names the case, and cells without meaning in a case are empty."""
 
-HELP = f"""Say whether a tool or part is free on a path: what it hits, where, how near it comes.
+HELP = f"""Check whether a tool or part is free on a path: hits, places, the least gap.
 
 Clear by a gap: no surface meets the tool's. Slides: it moves along what it
 touches where the path starts, and hits nothing. Overlaps: it hits nothing, but
 the part overlaps others by more than --contact and --overlap where it stands.
-Hits: a surface is met, what is touched is gone into, or one lies inside the
-other. Not decided: --seconds were over, or chord errors (STEP, IFC) leave
+Hits: the tool meets a surface, penetrates one that it touches, or one lies inside
+the other. Not decided: out of time (--seconds), or chord errors (STEP, IFC) leave
 it open. The triangles decide, between the poses, too; the gap is right to 0.01 mm
 or 1 %.
 

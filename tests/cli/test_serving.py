@@ -27,7 +27,7 @@ def scene(tmp_path: Path) -> Path:
         ("--tool none.stl", "no such file"), ("--prefix a\tb", "--prefix"),
         ("--tls-cert cert.pem", "--tls-key"), ("--seconds 0", "--seconds"),
         ("--role-url editor=none.db", "none.db"), ("owner=0123456789abcdef", "viewer, toucher"),
-        ("editor=short", "16"), ("editor", "ROLE="),
+        ("editor=short", "tokens, line 1: "), ("editor=short", "16"), ("editor", "ROLE="),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_line_and_starts_nothing(

@@ -8,7 +8,7 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from hapticdb.closing import Closes
-from hapticdb.errors import HapticDBError
+from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.hosted import Calls, HostedSession
@@ -36,6 +36,7 @@ class AttachedHost(Closes):
             self._channel.close()
             raise HapticDBError("no host answers at the other end of the socket") from error
         self._shared = SharedTable(descriptor)
+        self._is_closed = False
 
     def begin(
         self,
@@ -49,14 +50,21 @@ class AttachedHost(Closes):
     ) -> HostedSession:
         """Begin a session; as `SessionHost.begin`, with its errors."""
         options = {"where": where, "exclude": exclude, "coupling": coupling, "scale": scale}
+        if self._is_closed:
+            raise UsageError("the host was left: attach to it again")
         slot, session = self._channel.ask("begin", shell, start, options)
         return HostedSession(self._shared, slot, session, self._call)
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
+        if self._is_closed:
+            if word == "end":
+                return None
+            raise UsageError("the host was left: attach to it again")
         return self._channel.ask("call", word, session, *content)
 
     def close(self) -> None:
         """Leave the host; the sessions of this process end."""
+        self._is_closed = True
         self._channel.close()
         self._shared.close()
 

@@ -247,6 +247,9 @@ def test_another_process_begins_sessions_which_end_when_it_leaves(
     with pytest.raises(UsageError, match="scale"):
         attached.begin(sphere, ABOVE, scale=-1.0)
     attached.close()
+    mine.end()  # it has ended
+    with pytest.raises(UsageError, match="the host was left"):
+        attached.begin(sphere, ABOVE)
     until(lambda: [one.id for one in host.sessions()] == [session.id])
 
 

@@ -154,11 +154,15 @@ def _tokens(file: str | None, *, are_made: bool) -> "dict[str, Role]":
             lines = Path(file).read_text("utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"--token-file {file}: cannot be read: {error}") from None
-        for line in map(str.strip, lines):
+        for n, line in enumerate(map(str.strip, lines), start=1):
             if not line or line.startswith("#"):
                 continue
-            role, token = _pair(line, "--token-file")
-            check_token(token)
+            where = f"--token-file {file}, line {n}"
+            role, token = _pair(line, where)
+            try:
+                check_token(token)
+            except UsageError as error:
+                raise UsageError(f"{where}: {error}") from None
             tokens[token] = role
     return tokens
 

@@ -1,5 +1,7 @@
 """Clearances of a batch against brute force over all points and all voxels."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import hapticdb
+from assemblies import box, write_obj
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
-from hapticdb.batches import threads
+from hapticdb.batches import exact, threads
 from hapticdb.errors import UsageError
+from hapticdb.ingest.geometry import parts_of
+from hapticdb.mesh import Part
 from hapticdb.resident.table import LEAST_BUDGET
+from hapticdb.store.base import Object, Store
 from moving_boxes import Boxes, apart, mesh
 from session.worlds import HIERARCHICAL, SIZE, block, cloud, ids_by_voxel, make, poses_in, scatter
 from voxels import write_voxels
@@ -176,6 +182,10 @@ def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
             env.clearance(shell, poses, -1.0, exact=True)
         with pytest.raises(UsageError, match="no surface"):
             env.clearance(cloud(9), poses, exact=True)
+        with pytest.raises(UsageError, match="pose 1"):
+            env.collides(shell, np.stack([np.eye(4), 2.0 * np.eye(4)]), exact=True)
+        with pytest.raises(UsageError, match="on processors"):
+            env.clearance(shell, poses, exact=True, device="cuda")
     least = expected.min(axis=1)
     assert met.tolist() == (least == 0.0).tolist()
     assert 0 < met.sum() < count
@@ -186,3 +196,24 @@ def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
     assert between.at_least == pytest.approx(float(wanted[0, 0]), abs=1e-7)
     assert (between.a.name, between.b.name) == ("box0", "box1")
     assert np.linalg.norm(between.on_a - between.on_b) == pytest.approx(between.at_most)
+
+
+def test_the_least_distance_of_parts_with_chord_errors_has_both_bounds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cubes of 0.1 m, 0.2 and 0.35 m from the first one, each with a chord error of 0.05 m."""
+    cubes = {f"box{n}": box((x, 0, 0), (x + 0.1, 0.1, 0.1)) for n, x in enumerate((0, 0.3, 0.45))}
+    write_obj(tmp_path / "row.obj", cubes)
+    options = ImportOptions(grid=GridOptions(bits=6), distances=False)
+    hapticdb.import_files(tmp_path / "row.db", [tmp_path / "row.obj"], options)
+
+    def with_chords(store: Store, objects: list[Object]) -> Iterator[tuple[Object, Part]]:
+        for obj, part in parts_of(store, objects):
+            yield obj, replace(part, chord=0.05)
+
+    monkeypatch.setattr(exact, "parts_of", with_chords)
+    with hapticdb.open(tmp_path / "row.db") as env:
+        near, touching = env.distance("box0", "*"), env.distance("box1", "box2")
+    assert (near.b.name, touching.at_least) == ("box1", 0.0)
+    assert (near.at_least, near.at_most) == pytest.approx((0.1, 0.3), abs=1e-6)
+    assert touching.at_most == pytest.approx(0.15, abs=1e-6)

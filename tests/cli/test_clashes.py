@@ -4,6 +4,8 @@ import base64
 import csv
 import html
 import json
+import os
+import pty
 import re
 import zipfile
 from pathlib import Path
@@ -15,7 +17,8 @@ import pytest
 
 import hapticdb
 from assemblies import ball, box, row_of_boxes, write_obj
-from command_line import Run, refused
+from children import PATIENCE, child
+from command_line import Run, command, refused
 from hapticdb.pictures import reports
 from hapticdb.pictures.clashes import snapshot
 
@@ -235,3 +238,12 @@ def test_volumes_are_told_and_a_floor_decides(run: Run, meeting: Path, tmp_path:
     assert code == 0
     assert [json.loads(line)["volume"] for line in out.splitlines()] == [None]
     refused(run("clashes", meeting, "--least-volume", "1mm"), "no volume")
+
+
+def test_standard_output_has_the_result_while_a_terminal_shows_the_bar(meeting: Path) -> None:
+    ours, theirs = pty.openpty()
+    with child(command("clashes", meeting, "--json"), stderr=theirs) as process:
+        os.close(theirs)
+        out, _ = process.communicate(timeout=PATIENCE)
+    os.close(ours)
+    assert [json.loads(line)["kind"] for line in out.splitlines()] == ["overlapping", "touching"]

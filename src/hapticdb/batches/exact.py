@@ -6,9 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.batches.order import not_rigid
 from hapticdb.batches.result import ClearanceBatch
 from hapticdb.errors import UsageError
 from hapticdb.ingest.geometry import parts_of
+from hapticdb.kernels.rigid import first_not_rigid
 from hapticdb.kernels.surfaces.sides import TriangleTree
 from hapticdb.kernels.triangles.nearest import nearest
 from hapticdb.pointshell.moving import MovingSurface
@@ -45,20 +47,23 @@ def least_distance(store: Store, ones: Sequence[Object], others: Sequence[Object
     trees: dict[int, tuple[TriangleTree, float]] = {}
     for obj, part in parts_of(store, list({obj.id: obj for obj in (*ones, *others)}.values())):
         trees[obj.id] = tree_of(part.surface()), part.placed_chord
-    found: Distance | None = None
+    found, least_of_all = None, np.inf
     for n in np.argsort(gaps, axis=None, kind="stable").tolist():
         i, j = divmod(n, len(others))
         one, other, limit = ones[i], others[j], np.inf if found is None else found.at_most
         if gaps[i, j] >= limit or one.id == other.id:
             continue
         (tree, chord), (second, more_chord) = trees[one.id], trees[other.id]
-        near, error = nearest(tree, second, np.eye(4)[None], np.array([limit])), chord + more_chord
+        error = chord + more_chord
+        near = nearest(tree, second, np.eye(4)[None], np.array([limit + error]))
         if near.pairs[0, 0] >= 0:
             least, most = max(float(near.at_least[0]) - error, 0.0), float(near.at_most[0]) + error
-            found = Distance(one, other, least, most, near.on_a[0], near.on_b[0])
+            least_of_all = min(least_of_all, least)
+            if most < limit:
+                found = Distance(one, other, least, most, near.on_a[0], near.on_b[0])
     if found is None:
         raise UsageError("distance: give two different objects")
-    return found
+    return found._replace(at_least=least_of_all)
 
 
 def exact_clearance(
@@ -69,9 +74,12 @@ def exact_clearance(
     reach: float,
     progress: Callable[[int, int], None] | None,
 ) -> ClearanceBatch:
-    """Distances at rigid poses (B, 4, 4); broad phase by AABBs; UsageError without a surface."""
+    """Distances at rigid poses (B, 4, 4); broad phase by AABBs; UsageError otherwise."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
 
+    first = first_not_rigid(poses)
+    if first < len(poses):
+        raise not_rigid(first)
     tool = MovingSurface(shell)
     found = ClearanceBatch(len(poses), reach)
     places = np.zeros((len(poses), 3))

@@ -235,6 +235,7 @@ def bar(doing: str, noun: str, *, of: int = 1) -> "Iterator[Callable[[float, int
         TextColumn("{task.fields[count]}", markup=False),
         TimeRemainingColumn(compact=True),
         console=Console(file=sys.stderr),
+        redirect_stdout=False,  # to the terminal of standard error
         transient=True,
     )
     with shown:

@@ -73,7 +73,7 @@ class Queries:
 
     def _tool_of(self, file: object) -> PointShell:
         if not isinstance(file, str | os.PathLike):
-            raise UsageError("touch: give a tool, then one pose, or many as poses=...")
+            raise UsageError("give a tool, then one pose, or many as poses=...")
         return self.tool(file)
 
     @property
@@ -150,7 +150,7 @@ class Queries:
         if not isinstance(shell, PointShell):  # first: a test for paths takes a microsecond
             shell = self._tool_of(shell)
         if getattr(pose, "ndim", 2) == 3:
-            raise UsageError("touch: give a tool, then one pose, or many as poses=...")
+            raise UsageError("give a tool, then one pose, or many as poses=...")
         if pose is not None:
             felt = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)
             chosen = as_law(law) if isinstance(law, str) else law
@@ -199,7 +199,7 @@ class Queries:
 
     def collides(
         self,
-        shell: PointShell,
+        shell: PointShell | FilePath,
         poses: ArrayLike,
         *,
         where: Words = (),
@@ -219,14 +219,17 @@ class Queries:
             from hapticdb.batches.exact import MET  # noqa: PLC0415 - loads kernels
 
             return ~self.clearance(
-                shell, poses, MET, where=where, exclude=exclude, exact=True, progress=progress
-            ).is_beyond
+                shell, poses, MET, where=where, exclude=exclude, exact=True, device=device,
+                progress=progress,
+            ).is_beyond  # fmt: skip
+        if not isinstance(shell, PointShell):
+            shell = self._tool_of(shell)
         with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
             return feeler.collides(poses, progress=progress)
 
     def clearance(
         self,
-        shell: PointShell,
+        shell: PointShell | FilePath,
         poses: ArrayLike,
         reach: float | None = None,
         *,
@@ -249,10 +252,14 @@ class Queries:
         Raises `UsageError` for a pose that is not rigid, a reach that is not positive, or one too
         large for the memory; `ObjectNotFoundError` as for `touch`.
         """
+        if not isinstance(shell, PointShell):
+            shell = self._tool_of(shell)
         if exact:
             from hapticdb.batches.exact import exact_clearance  # noqa: PLC0415 - loads kernels
             from hapticdb.batches.feeler import reach_of  # noqa: PLC0415 - likewise
 
+            if device != "cpu":
+                raise UsageError(f"device {device!r}: exact distances are computed on processors")
             limit = np.inf if reach is None else reach_of(reach, 1.0)
             with self._store.snapshot():
                 felt = Filter(where, exclude).felt(self._store.objects(), self._store.url)

@@ -200,7 +200,8 @@ def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Ext
         motions=n_motions,
         poses=n_poses,
         is_planned=is_planned,
-        is_out_of_time=way is None and time.monotonic() > until,
+        is_out_of_time=time.monotonic() > until
+        and (way is None or way.verdict is PathVerdict.NOT_DECIDED),
         seconds=0.0,
         seed=asked.seed,
     )

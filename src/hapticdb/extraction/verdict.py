@@ -74,7 +74,8 @@ def failed_line(failed: FailedSearch) -> str:
 
 
 def _no_order(found: Disassembly) -> str:
-    tried = f"no order found in {len(found.failed) + len(found.steps)} searches"
+    n_searches = len(found.failed) + len(found.steps)
+    tried = f"no order found in {n_searches} search{'es' * (n_searches != 1)}"
     if found.is_out_of_time:
         tried += ", the time is over"
     blockers = names_of([one.object for one in found.blockers])

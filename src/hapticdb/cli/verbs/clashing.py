@@ -1,15 +1,16 @@
 """The verb clashes."""
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
 import hapticdb
 from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
-from hapticdb.cli.emit import CsvWriter, TableOutput, new_files, open_csv
+from hapticdb.cli.emit import TableOutput, new_files, open_csv
 from hapticdb.cli.schema import AXES, plain
 from hapticdb.cli.values import Point, budget_bytes
 from hapticdb.errors import UsageError
@@ -154,10 +155,10 @@ def clashes(
         open_csv(output.csv, PAIRS) as table,
         new_files(**output.reports) as files,
         opened_to_keep(url) as env,
-        render.bar("measuring", "pairs") as progress,
     ):
         add_rules(env.store, meant.rule or (), pairs.within, meant.rules)
-        found = hapticdb.find_clashes(
+        with render.bar("measuring", "pairs") as progress:
+            found = hapticdb.find_clashes(
                 env, within=pairs.within, contact=pairs.contact, of=pairs.of or (),
                 against=pairs.against or (), on=pairs.on, seconds=pairs.seconds,
                 budget=budget_bytes(pairs.budget), progress=progress)  # fmt: skip
@@ -173,7 +174,9 @@ def clashes(
                 write_reports(files, env, found, told.pairs, told.groups, kinds)
         if because is not None:
             raise typer.Exit(told.accept(env, because, output))
-        told.say(url, table, output, is_grouped=meant.group is None and not meant.all_)
+        if table is not None:
+            table.add(*told.records())
+    told.say(url, output, is_grouped=meant.group is None and not meant.all_)
     raise typer.Exit(_exit_code(found, kinds))
 
 
@@ -210,12 +213,15 @@ class _Told(NamedTuple):
         accept_pairs(env.store, pairs, self.found.known, because or None)
         return _say_accepted(pairs, because, output)
 
-    def say(self, url: str, table: CsvWriter | None, output: _Output, *, is_grouped: bool) -> None:
+    def records(self) -> Iterator[dict[str, Any]]:
+        """Records of the pairs, with their groups."""
+        for one in self.pairs:
+            yield plain(one) | {"group": self.ids.get((one.a, one.b))}
+
+    def say(self, url: str, output: _Output, *, is_grouped: bool) -> None:
         """Print groups or pairs, and the reach of the rules."""
-        if table or output.json:
-            ids = self.ids
-            told = (plain(one) | {"group": ids.get((one.a, one.b))} for one in self.pairs)
-            output.add(table, *told)
+        if output.json:
+            output.add(None, *self.records())
         if output.has_words:
             _show_groups(self.groups) if is_grouped else _show_pairs(self.pairs)
             _show_facts(self.found, self.groups)

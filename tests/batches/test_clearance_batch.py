@@ -201,7 +201,11 @@ def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
 def test_the_least_distance_of_parts_with_chord_errors_has_both_bounds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Cubes of 0.1 m, 0.2 and 0.35 m from the first one, each with a chord error of 0.05 m."""
+    """Cubes of 0.1 m, 0.2 and 0.35 m from the first one, each with a chord error of 0.05 m.
+
+    The third one's AABB is beyond the upper bound, so its surface is not read.
+    """
+    read: list[str] = []
     cubes = {f"box{n}": box((x, 0, 0), (x + 0.1, 0.1, 0.1)) for n, x in enumerate((0, 0.3, 0.45))}
     write_obj(tmp_path / "row.obj", cubes)
     options = ImportOptions(grid=GridOptions(bits=6), distances=False)
@@ -209,11 +213,14 @@ def test_the_least_distance_of_parts_with_chord_errors_has_both_bounds(
 
     def with_chords(store: Store, objects: list[Object]) -> Iterator[tuple[Object, Part]]:
         for obj, part in parts_of(store, objects):
+            read.append(obj.name)
             yield obj, replace(part, chord=0.05)
 
     monkeypatch.setattr(exact, "parts_of", with_chords)
     with hapticdb.open(tmp_path / "row.db") as env:
-        near, touching = env.distance("box0", "*"), env.distance("box1", "box2")
+        near = env.distance("box0", "*")
+        assert read == ["box0", "box1"]
+        touching = env.distance("box1", "box2")
     assert (near.b.name, touching.at_least) == ("box1", 0.0)
     assert (near.at_least, near.at_most) == pytest.approx((0.1, 0.3), abs=1e-6)
     assert touching.at_most == pytest.approx(0.15, abs=1e-6)

@@ -45,22 +45,29 @@ def least_distance(store: Store, ones: Sequence[Object], others: Sequence[Object
     apart = np.maximum(boxes[:, None, 0] - more[None, :, 1], more[None, :, 0] - boxes[:, None, 1])
     gaps = np.linalg.norm(np.maximum(apart, 0.0), axis=2)
     trees: dict[int, tuple[TriangleTree, float]] = {}
-    for obj, part in parts_of(store, list({obj.id: obj for obj in (*ones, *others)}.values())):
-        trees[obj.id] = tree_of(part.surface()), part.placed_chord
-    found, least_of_all = None, np.inf
+
+    def tree_and_chord(obj: Object) -> tuple[TriangleTree, float]:
+        if obj.id not in trees:
+            ((_, part),) = parts_of(store, [obj])
+            trees[obj.id] = tree_of(part.surface()), part.placed_chord
+        return trees[obj.id]
+
+    found, least_of_all, limit = None, np.inf, np.inf
     for n in np.argsort(gaps, axis=None, kind="stable").tolist():
         i, j = divmod(n, len(others))
-        one, other, limit = ones[i], others[j], np.inf if found is None else found.at_most
-        if gaps[i, j] >= limit or one.id == other.id:
+        if gaps[i, j] >= limit:
+            break
+        one, other = ones[i], others[j]
+        if one.id == other.id:
             continue
-        (tree, chord), (second, more_chord) = trees[one.id], trees[other.id]
+        (tree, chord), (second, more_chord) = tree_and_chord(one), tree_and_chord(other)
         error = chord + more_chord
         near = nearest(tree, second, np.eye(4)[None], np.array([limit + error]))
         if near.pairs[0, 0] >= 0:
             least, most = max(float(near.at_least[0]) - error, 0.0), float(near.at_most[0]) + error
             least_of_all = min(least_of_all, least)
             if most < limit:
-                found = Distance(one, other, least, most, near.on_a[0], near.on_b[0])
+                found, limit = Distance(one, other, least, most, near.on_a[0], near.on_b[0]), most
     if found is None:
         raise UsageError("distance: give two different objects")
     return found._replace(at_least=least_of_all)

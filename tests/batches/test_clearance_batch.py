@@ -192,6 +192,8 @@ def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
     assert found.distances == pytest.approx(np.where(least < reach, least, np.inf), abs=1e-8)
     assert only.distances == pytest.approx(expected[:, 1], abs=1e-8)
     assert found.is_beyond.tolist() == (least >= reach).tolist()
+    assert "with nothing within 0.15 m" in repr(found)
+    assert "0 with nothing there, least" in repr(only)
     wanted, _ = apart(halves[1], places[1:], Boxes(places[:1], halves[:1]))
     assert between.at_least == pytest.approx(float(wanted[0, 0]), abs=1e-7)
     assert (between.a.name, between.b.name) == ("box0", "box1")

@@ -172,6 +172,11 @@ def test_a_turn_and_a_path_say_when_parts_meet(run: Run, tmp_path: Path) -> None
     code, out, _ = run("clashes", path, "--of", "cube0", "--poses", tmp_path / "way.csv")
     assert (code, out) == (0, "0 meetings on the way\n")
     refused(run("clashes", path, "--turn", "z"), "--of")
+    for more in ("--least-volume 1", "--all", "--within 2", "--budget 0", "--junit a.xml"):
+        words = ("--of", "cube0", "--turn", "z", *more.split())
+        refused(run("clashes", path, *words), more.split()[0], "with --poses and --turn")
+    for more in ("--from 1", "--about 0,0,0"):
+        refused(run("clashes", path, *more.split()), more.split()[0], "without --poses")
     refused(run("clashes", path, "--of", "cube0", "--turn", "w"), "--turn x, y or z")
 
 
@@ -222,8 +227,8 @@ def test_accepting_needs_a_reason_and_takes_no_other_work(
     }
     refused(run("clashes", meeting, "--group", group, "--because", " "), "an empty reason")
     given = ("--accept", "1", "2", "--because", "a press fit")
-    refused(run("clashes", meeting, *given, "--rule", "1 and 2: ignore"), "takes no rules")
-    refused(run("clashes", meeting, *given, "--csv", tmp_path / "a.csv"), "writes no report")
+    refused(run("clashes", meeting, *given, "--rule", "1 and 2: ignore"), "--rule", "with --accept")
+    refused(run("clashes", meeting, *given, "--csv", tmp_path / "a.csv"), "--csv", "with --because")
     assert run("clashes", meeting)[0] == 1
 
 

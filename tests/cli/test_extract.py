@@ -64,6 +64,9 @@ def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
     assert not Path("out.csv").exists()
     found = json.loads(run("extract", url, "block", "--motions", 0, "--json")[1])
     assert (found["way"], found["blockers"][0]["name"]) == (None, "cage")
+    to = ("--to", "0,0,500,1,0,0,0", "--motions", 0, "--json")
+    found = json.loads(run("extract", url, "block", *to)[1])
+    assert 1 < found["blockers"][0]["pulls"] <= found["pulls"]
 
 
 def test_wrong_arguments_are_refused(

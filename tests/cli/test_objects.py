@@ -65,6 +65,9 @@ def test_a_table_is_as_narrow_as_the_terminal(bolts: Path, monkeypatch: pytest.M
     assert max(map(len, lines)) <= 52
     assert "fr…bolt_1" in lines[3]
     monkeypatch.setenv("COLUMNS", "40")
+    lines = on_terminal("objects", bolts, "--limit", 2).splitlines()
+    assert max(map(len, lines[:-1])) <= 40
+    assert [line.split()[:2] for line in lines[:2]] == [["id", "1"], ["name", "frame/bolt_0"]]
     shown = on_terminal("info", bolts)
     assert max(map(len, shown.splitlines())) <= 40
     assert re.search(r"scene +.*\n +\S", shown)  # goes on below its beginning
@@ -91,3 +94,5 @@ def test_columns_stand_below_their_headings(capsys: pytest.CaptureFixture[str]) 
         " 12   a somewhat longer text   9,000",
         "  3   部品",
     ]
+    render.facts([("on 部品", "1"), ("on \x1b[2J", "2")])
+    assert capsys.readouterr().out.splitlines() == ["on 部品     1", "on \\x1b[2J  2"]

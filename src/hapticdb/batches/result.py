@@ -128,9 +128,11 @@ class ClearanceBatch:
 
     def __repr__(self) -> str:
         least = f"least {self.distances.min():.4g} m, " if len(self) else ""
+        reach = f"within {self.reach:.4g} m" if np.isfinite(self.reach) else "there"
+        n_beyond = np.count_nonzero(self.is_beyond)
         return (
-            f"ClearanceBatch({len(self)} poses, {np.count_nonzero(self.is_beyond)} with nothing "
-            f"within {self.reach:.4g} m, {least}revision {self.revision})"
+            f"ClearanceBatch({len(self)} poses, {n_beyond} with nothing {reach}, {least}"
+            f"revision {self.revision})"
         )
 
     @property

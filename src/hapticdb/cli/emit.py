@@ -145,5 +145,5 @@ def new_files(**named: str | None) -> Iterator[dict[str, Path]]:
 
 def text_cell(text: str) -> str:
     """A name as a cell: printable, and no formula."""
-    shown = render.printable(text).replace("\n", "\\n")
+    shown = render.one_line(text)
     return f"'{shown}" if shown.startswith(FORMULAS) else shown

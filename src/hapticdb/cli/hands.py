@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hapticdb.cli.values import Point
+from hapticdb.cli.values import Point, refuse
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -48,16 +48,10 @@ class HandOptions:
             raise UsageError(f"--seed {seed}: give 0 or more")
         if word == "random" and self.at is None:
             raise UsageError("--device random: give --at, where the hand is")
-        if word != "random" and self.at is not None:
-            raise UsageError(f"--at belongs to random, not to {word}")
-        if self.loop and word == "random":
-            raise UsageError("--loop: --device random has no end; leave it out")
-        if self.speed is not None and word.lower().endswith(".hdbrec"):
-            raise UsageError(f"--speed: --device {word} has its own; leave it out")
-        if word in VENDORS and (self.simulate or self.loop or self.speed is not None):
-            raise UsageError(
-                f"--device {word} is a real hand: leave out --simulate, --loop, --speed"
-            )
+        unused = "loop" if word == "random" else "at"
+        unused += " simulate loop speed" if word in VENDORS else ""
+        unused += " speed" if word.lower().endswith(".hdbrec") else ""
+        refuse(f"with --device {word}", self, unused)
 
     def _vendor_device(self, profile: "DeviceProfile | None") -> "Device":
         from importlib import import_module

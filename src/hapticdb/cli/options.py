@@ -62,7 +62,8 @@ import.jobs N [one a processor]: Threads.
 import.keep_removed: Leave out parts that were removed.
 import.time_limit SECONDS [20 and more by its size]: Time that reading one file may take.
 import.memory_limit MIB [512 and more by its size]: Memory that reading one file may take.
-import.voxel_limit N: Voxels that the surfaces of one file may meet, by their area.
+import.voxel_limit N [a minute's work]: Voxels that the surfaces of one file may meet, by their
+  area.
 import.replace: Replace objects of these files by what the files hold now.
 import.distances [yes for bricks]: Store distances to surfaces, which coupled sessions need, in a
   new environment.

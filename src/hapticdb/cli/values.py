@@ -1,17 +1,29 @@
 """Values of options: numbers and sizes in memory or on disk."""
 
 import re
+from dataclasses import fields
 from math import isfinite
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from hapticdb.errors import UsageError
 from hapticdb.units import NAMES, length_of
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 MIB = 1 << 20
 LARGEST_MIB = 1e6
 """Largest size of an option, MiB; a larger one is refused as a typing error."""
 SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
 """Size of an option; a number without a unit is MiB."""
+
+
+def refuse(where: str, group: "DataclassInstance", names: str = "") -> None:
+    """UsageError for given options of a group, some or all, without a meaning there."""
+    for one in fields(group):
+        if (not names or one.name in names.split()) and getattr(group, one.name) != one.default:
+            flag = one.name.rstrip("_").replace("_", "-")
+            raise UsageError(f"--{flag} has no meaning {where}: leave it out")
 
 
 class Point(NamedTuple):

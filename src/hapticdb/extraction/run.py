@@ -196,7 +196,7 @@ def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Ext
         way=way,
         near=tuple(space.start.objects),
         blockers=tuple(Blocker(known[i], n) for i, n in _blockers(pulls, *refuting) if i in known),
-        pulls=len(pulls.done),
+        pulls=len(pulls.done) + bool(refuting),
         motions=n_motions,
         poses=n_poses,
         is_planned=is_planned,

@@ -87,9 +87,6 @@ class FileReport:
 
 MOST_AHEAD = 1 << 29
 """Most bytes of geometry in memory of files read ahead. Less: more files are read twice."""
-VOXEL_LIMIT = 1e9
-"""Default of `ImportOptions.voxel_limit`: a minute of one processor with distances, a quarter of
-that without. Larger: longer imports of files meant for larger voxels."""
 _READING = ("unit", "time_limit", "memory_limit", "chord")
 
 
@@ -112,8 +109,9 @@ class ImportOptions:
     time_limit: float | None = None
     memory_limit: int | None = None
     """Greatest time (s) and memory (bytes) for reading one file, see `hapticdb.mesh.read_file`."""
-    voxel_limit: float = VOXEL_LIMIT
-    """Most voxels met by the surfaces of one file, estimated by their area."""
+    voxel_limit: float | None = None
+    """Most voxels met by the surfaces of one file, estimated by their area; see
+    `hapticdb.ingest.planning.check_cost`."""
     chord: float | None = None
     """Greatest chord error of the tessellations of STEP and IFC files, metres; unless given as for
     `hapticdb.mesh.read_file`. The resulting ones are stored with the surfaces, see `Part.chord`."""

@@ -23,6 +23,9 @@ from hapticdb.units import length_text
 MOST_ATTEMPTS = 100
 """Attempts to add a part against other processes that add and remove it; then an error is
 raised."""
+VOXEL_LIMIT = 1e9
+"""Default of `check_cost`: a minute of one processor with distances, a quarter of that without.
+Larger: longer imports of files meant for larger voxels."""
 FACES_AT_ONCE = 1 << 20
 """Triangles of a batch for their area. A larger value takes more memory."""
 AT_BORDER = 1e-6
@@ -48,12 +51,13 @@ def check_inside(parts: Iterable[Part], link: str, grid: Grid) -> None:
         bounds_inside(part, link, grid)
 
 
-def check_cost(parts: Iterable[Part], link: str, grid: Grid, most: float) -> None:
-    """Refuse parts of the file `link` on more than `most` voxels, estimated by their area.
+def check_cost(parts: Iterable[Part], link: str, grid: Grid, most: float | None) -> None:
+    """Refuse parts of the file `link` on more voxels than `most`, estimated by their area.
 
-    A triangle soup of 5 MB may meet 10^10 voxels, ten minutes of work.
+    most : `VOXEL_LIMIT` unless given. A triangle soup of 5 MB may meet 10^10 voxels, ten minutes of
+    work.
     """
-    size = grid.voxel_size
+    size, most = grid.voxel_size, most or VOXEL_LIMIT
     met = sum(_area(part) for part in parts) / size**2
     if met > most:
         shown = float(f"{met:.2g}")
@@ -180,7 +184,7 @@ def planned(
     *,
     replace: bool,
     keep_removed: bool,
-    voxel_limit: float,
+    voxel_limit: float | None,
 ) -> Plan:
     """Plan of a file's import into an environment; nothing is read or written.
 

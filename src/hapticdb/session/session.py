@@ -11,7 +11,7 @@ from hapticdb.closing import Closes
 from hapticdb.devices.handle import Handle
 from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
-from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.errors import DeviceError, HapticDBError, UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE, ForceLaw, LawName, as_law, reads_distances
 from hapticdb.recording.file import DEFAULT_LIMIT, Recorder
@@ -132,6 +132,7 @@ class Session(Closes):
         has_baseline: bool = True,
     ) -> None:
         check_device(device)
+        self._device = device
         _check_choices(seconds, staleness)
         self._has_baseline = has_baseline
         self.shell, self.handle = shell, handle or Handle()
@@ -287,7 +288,11 @@ class Session(Closes):
         self.ask_to_end()
         report = self.wait(END_PATIENCE)
         if report is None:
-            raise HapticDBError("the loop did not end when asked to")
+            device = type(self._device).__name__
+            raise DeviceError(
+                f"{device}: a call of read() or apply() takes longer than {END_PATIENCE:g} s; "
+                "check its connection and its driver"
+            )
         return report
 
     def _drain(self, running: Running) -> None:

@@ -12,14 +12,14 @@ import pytest
 
 from children import child, exit_code
 from hapticdb import Environment, PointShell
-from hapticdb.errors import FileError, HapticDBError, UsageError
+from hapticdb.errors import DeviceError, FileError, HapticDBError, UsageError
 from hapticdb.recording.file import Recorder, Recording
 from hapticdb.resident.table import is_alive
 from hapticdb.session import session as module
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.processes import process
 from hapticdb.session.session import Session
-from session.hands import Noted, still
+from session.hands import Noted, Slow, still
 from session.sessions import RATE, until
 
 DEEP = 0.0085
@@ -145,6 +145,19 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
         with pytest.raises(KeyboardInterrupt):
             Session(cells, sphere, still(DEEP), law="plane", record=path)
         assert not path.exists()
+
+
+def test_a_device_that_hangs_is_named_when_its_session_ends(
+    voxel_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "END_PATIENCE", 0.1)
+    monkeypatch.setattr(process, "END_PATIENCE", 0.1)
+    hand = Slow(still(0.03), 50, 60.0)
+    with Session(voxel_floor.url, sphere, hand, law="plane", has_baseline=False) as begun:
+        until(lambda: begun.n_frames > 5)
+        begun.wait(0.2)
+        with pytest.raises(DeviceError, match=r"^Slow: a call of read\(\) or apply\(\) takes"):
+            begun.stop()
 
 
 # -- wrong arguments -----------------------------------------------------------------------------

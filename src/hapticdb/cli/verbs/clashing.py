@@ -12,7 +12,7 @@ from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.emit import TableOutput, new_files, open_csv
 from hapticdb.cli.schema import AXES, plain
-from hapticdb.cli.values import Point, budget_bytes
+from hapticdb.cli.values import Point, budget_bytes, refuse
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text, place_text
 from hapticdb.verdicts import REPORTED, Kind
@@ -117,11 +117,6 @@ class TurnOptions:
     from_: float = 0.0
     to: float = 90.0
 
-    @property
-    def is_given(self) -> bool:
-        """Whether parts move."""
-        return self.poses is not None or self.turn is not None
-
 
 @dataclass(frozen=True)
 class _Output(TableOutput):
@@ -139,16 +134,20 @@ def clashes(
     url: str, *, pairs: PairOptions, meant: RuleOptions, motion: TurnOptions, output: _Output
 ) -> None:
     """Find all pairs of near objects; the help text is `HELP`."""
-    has_reports, has_rules = any(output.reports.values()), bool(meant.rules or meant.rule)
-    accept, because, kinds = meant.accept, meant.because, pairs.kinds
-    if because is not None and (output.csv or has_reports or (accept and has_rules)):
-        raise UsageError("--because writes no report, and --accept takes no rules: leave them out")
-    if accept is not None or (because is not None and meant.group is None):
-        raise typer.Exit(_accept(url, accept, because, output))
-    if motion.is_given:
-        if has_reports or has_rules or pairs.seconds or pairs.on or meant.group or not pairs.of:
-            raise UsageError("--poses and --turn: give --of; no report, rule, --seconds, --on")
+    because, kinds = meant.because, pairs.kinds
+    if because is not None:
+        refuse("with --because", output, "csv html junit bcf")
+        refuse("with --because", motion)
+    if meant.accept is not None or (because is not None and meant.group is None):
+        refuse("with --accept", pairs)
+        refuse("with --accept", meant, "rules rule group all_ least_volume")
+        raise typer.Exit(_accept(url, meant.accept, because, output))
+    if motion.poses is not None or motion.turn is not None:
+        refuse("with --poses and --turn", pairs, "within seconds budget on")
+        refuse("with --poses and --turn", meant)
+        refuse("with --poses and --turn", output, "html junit bcf")
         raise typer.Exit(_moved(url, pairs, motion, output))
+    refuse("without --poses and --turn", motion)
     from hapticdb.clashes.rules import add_rules
 
     with (
@@ -258,8 +257,10 @@ def _meetings(url: str, pairs: PairOptions, motion: TurnOptions) -> "list[Meetin
     from hapticdb.store.attributes import scene_bounds
 
     poses, turn, about, of = motion.poses, motion.turn, motion.about, pairs.of or []
-    if (poses is None) == (turn is None) or turn not in {None, *AXES}:
-        raise UsageError("give either --poses CSV, or --turn x, y or z")
+    if (poses is None) == (turn is None) or turn not in {None, *AXES} or not of:
+        raise UsageError("give --of, and either --poses CSV, or --turn x, y or z")
+    if poses is not None:
+        refuse("with --poses", motion, "from_ to")
     with (
         hapticdb.open(url, read_only=True) as env,
         render.bar("moving", "objects") as progress,

@@ -12,7 +12,7 @@ from hapticdb.cli import render
 from hapticdb.cli.choosing import FilterOptions, ids_of
 from hapticdb.cli.emit import Output
 from hapticdb.cli.schema import plain
-from hapticdb.cli.values import budget_bytes, numbers_of, point_of
+from hapticdb.cli.values import budget_bytes, numbers_of, point_of, refuse
 from hapticdb.errors import UsageError
 from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 
@@ -67,8 +67,8 @@ class OrderOptions:
     on: str | None = None
 
     def __post_init__(self) -> None:
-        if not self.disassemble and (self.depth is not None or self.keep or self.on):
-            raise UsageError("--depth, --keep and --on go with --disassemble")
+        if not self.disassemble:
+            refuse("without --disassemble", self)
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,7 @@ class _Output(Output):
 
     def __post_init__(self) -> None:
         if self.animation is None:
+            refuse("without --animation", self, "up")
             return
         if not self.animation.lower().endswith(".html"):
             raise UsageError(
@@ -126,8 +127,9 @@ def extract(
     from hapticdb.extraction.disassembly import disassemble
     from hapticdb.extraction.run import extract as search_way
 
-    if to and (order.disassemble or search.out or search.screw):
-        raise UsageError("--to goes with none of --disassemble, --out and --screw")
+    if to:
+        refuse("with --to", order, "disassemble")
+        refuse("with --to", search, "out screw")
     goal = _goal(to) if to else None
     options: dict[str, Any] = vars(search) | {"budget_bytes": budget_bytes(budget)}
     options |= {"depth": order.depth} if order.disassemble else {"to": goal}

@@ -18,8 +18,7 @@ from hapticdb.cli.hands import HandOptions
 from hapticdb.cli.options import FramesOn, LawName, RenderingName
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.cli.tools import ToolOptions
-from hapticdb.cli.values import budget_bytes, size_bytes
-from hapticdb.errors import UsageError
+from hapticdb.cli.values import budget_bytes, refuse, size_bytes
 
 if TYPE_CHECKING:
     from hapticdb.devices.profiles import DeviceProfile
@@ -61,8 +60,7 @@ class ForceOptions:
         if rendering == "coupled":
             delay = None if self.delay is None else 1e-3 * self.delay
             return None, Coupling(self.stiffness, self.cap, delay=delay, profile=self.profile)
-        if self.delay is not None:
-            raise UsageError("--delay belongs to --rendering coupled: leave it out")
+        refuse("with --rendering direct", self, "delay")
         stiffness = CONTACT_STIFFNESS if self.stiffness is None else self.stiffness
         law = law_named(self.law or "distance", stiffness)
         return law, Coupling(cap=self.cap, profile=self.profile)
@@ -82,8 +80,8 @@ class RecordOptions:
 
         limit = self.record_limit
         bytes_ = DEFAULT_LIMIT if limit is None else size_bytes(limit, "--record-limit")
-        if self.record is None and (self.replace or limit is not None):
-            raise UsageError("--replace and --record-limit belong to --record: give it, too")
+        if self.record is None:
+            refuse("without --record", self)
         return {
             "record": self.record, "replace_recording": self.replace, "record_limit_bytes": bytes_
         }  # fmt: skip

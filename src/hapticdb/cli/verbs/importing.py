@@ -52,7 +52,7 @@ class ReadingOptions:
     on: str | None = None
     time_limit: float | None = None
     memory_limit: int | None = None
-    voxel_limit: int = 1_000_000_000
+    voxel_limit: int | None = None
 
 
 def import_(

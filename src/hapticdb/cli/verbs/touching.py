@@ -15,6 +15,7 @@ from hapticdb.cli.felt_files import columns_of, open_felt
 from hapticdb.cli.options import LawName, StrategyName, UnitName
 from hapticdb.cli.schema import record
 from hapticdb.cli.tools import ToolOptions, shell_record, shell_text
+from hapticdb.cli.values import refuse
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -46,14 +47,22 @@ class _Output(TableOutput):
     on: str = "cpu"
 
     def __post_init__(self) -> None:
-        if self.out is not None and (self.csv or self.contacts_csv or self.json):
-            raise UsageError("--out: leave out --csv, --contacts-csv and --json")
+        if self.out is not None:
+            refuse("with --out", self, "csv contacts_csv json")
+        else:
+            refuse("without --out", self, "on")
         if [self.csv, self.contacts_csv, "-" if self.json else ""].count(STDOUT) > 1:
             raise UsageError(
                 "--csv -, --contacts-csv - and --json: only one may be standard output"
             )
-        if self.on != "cpu" and self.out is None:
-            raise UsageError(f"--on {self.on}: give --out, too")
+
+
+@dataclass(frozen=True)
+class QueryOptions:
+    """Options of the queries of single poses."""
+
+    strategy: StrategyName = "auto"
+    maxgap: int = 500
 
 
 def touch(
@@ -62,8 +71,7 @@ def touch(
     tool: ToolOptions,
     poses: str,
     path_unit: UnitName | None = None,
-    strategy: StrategyName = "auto",
-    maxgap: int = 500,
+    query: QueryOptions,
     felt: FilterOptions,
     law: LawName | None = None,
     stiffness: float = 1000.0,
@@ -76,6 +84,10 @@ def touch(
     import hapticdb
     from hapticdb.query.law import law_named
 
+    if output.out is not None:
+        refuse("with --out", query)
+    if query.strategy != "maxgap":
+        refuse("without --strategy maxgap", query, "maxgap")
     path = _path_of(poses, path_unit, output)
     summary = _Summary()
     with (
@@ -91,8 +103,8 @@ def touch(
             pieces = env.touch_pieces(shell, path, on=output.on, **which)
             _touch_into(Path(output.out), shell, pieces)
             return
-        used = _strategy_of(strategy, env, len(path))
-        touch_at = partial(env.touch, shell, strategy=used, maxgap=maxgap, **which)
+        used = _strategy_of(query.strategy, env, len(path))
+        touch_at = partial(env.touch, shell, strategy=used, maxgap=query.maxgap, **which)
         touch_at(path[0])  # compiles kernels and reads statistics, outside of the frames' times
         for index, pose in enumerate(path):
             touched = touch_at(pose)

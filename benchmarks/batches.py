@@ -217,12 +217,12 @@ def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> 
     cells: list[dict[str, Any]] = []
     notes: list[str] = []
     with hapticdb.open(folder / "car.db", read_only=True) as env:
-        along = sample.wrench, sample.path
+        along = sample.spanner, sample.path
         if model is not None:
             along = write_along(folder / "along", folder / "car.db", PATH_FRAMES)
         path = read_poses(along[1])
-        wrench = trimesh.load_mesh(along[0])
-        mesh = np.asarray(wrench.vertices, np.float64), np.asarray(wrench.faces, np.int64)
+        tool = trimesh.load_mesh(along[0])
+        mesh = np.asarray(tool.vertices, np.float64), np.asarray(tool.faces, np.int64)
         for n_points in settings.points:
             shell = PointShell.from_file(along[0], points=n_points)
             found, missing = measure_tool(env, Tool(shell, mesh), parts, path, settings)

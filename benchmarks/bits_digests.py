@@ -130,7 +130,7 @@ def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Resul
 
 
 def swept(place: Place, tool: Tool, results: Results) -> None:
-    """Digest the result of ``sweep`` on the wrench's path, without time and names of files."""
+    """Digest the result of ``sweep`` on the spanner's path, without time and names of files."""
     verdict = command("sweep", place.url, "--tool", tool.mesh, "--path", tool.path)
     for name in ("elapsed", "moved", "path"):
         del verdict[name]

@@ -91,7 +91,7 @@ def import_car(folder: Path, servers: contextlib.ExitStack, *, is_quick: bool) -
 
 
 def sample_tool(folder: Path, place: Place, n_poses: int) -> Tool:
-    """Write the sample's wrench and its path along the environment, and choose the poses."""
+    """Write the sample's spanner and its path along the environment, and choose the poses."""
     mesh, path = write_along(folder / "sample", place.url, 1000)
     hand = path.with_name("hand.csv")
     slide = hapticdb.read_poses(path)

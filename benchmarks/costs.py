@@ -90,7 +90,7 @@ def measured(folder: Path, model: Model, bits: int) -> dict[str, Any]:
 
 def first_start(folder: Path, sample: SampleFiles) -> list[dict[str, Any]]:
     """Seconds of first commands of a new copy as a wheel has it, and of the same commands again."""
-    places = {"car": sample.car, "tool": sample.wrench, "path": sample.path}
+    places = {"car": sample.car, "tool": sample.spanner, "path": sample.path}
     shutil.copytree(
         PACKAGE, folder / "hapticdb", ignore=shutil.ignore_patterns("__pycache__", "_machine")
     )

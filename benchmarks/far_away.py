@@ -4,7 +4,7 @@
     python benchmarks/far_away.py --quick      # short sessions, into results-quick/
 
 A relay on the loopback interface holds back whatever passes between `feel` and the server for half
-of a round trip each way. A wrench slides over the model, and the cells are new wherever it comes.
+of a round trip each way. A spanner slides over the model, and the cells are new wherever it comes.
 HAPTICDB_SERVER is the URL of a server to use instead of one of its own, in whose database an
 environment may be made.
 """
@@ -116,7 +116,7 @@ def measure(folder: Path, model: Path | None, bits: int, seconds: float) -> dict
     with server_url(folder) as server:
         url = with_environment(server, "far_away")
         hapticdb.import_files(url, [model or sample.car], options)
-        tool, path = sample.wrench, sample.path
+        tool, path = sample.spanner, sample.path
         if model is not None:
             tool, path = write_along(folder / "along", url, FRAMES)
         for speed in SPEEDS:

@@ -154,7 +154,7 @@ def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
     results = records.conditions() | {"seconds": effort.seconds}
     with environments(folder, model or sample.car, effort.bits) as urls:
         database = Path(urls["SQLite"])
-        tool, path = sample.wrench, sample.path
+        tool, path = sample.spanner, sample.path
         if model is not None:
             tool, path = write_along(folder / "along", database, FRAMES)
         with hapticdb.open(database, read_only=True) as env:

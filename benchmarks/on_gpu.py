@@ -64,7 +64,7 @@ def prepare(folder: Path, bits: int, most: int) -> None:
     hapticdb.import_files(
         str(url), [car], ImportOptions(grid=GridOptions(bits=bits, extent=EXTENT))
     )
-    tool, path = sample.wrench, sample.path
+    tool, path = sample.spanner, sample.path
     if real.is_file():
         tool, path = write_along(folder / "along", url, 400)
     few, many = (PointShell.from_file(tool, points=n) for n in (FEW, BASE))

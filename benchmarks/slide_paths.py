@@ -163,21 +163,21 @@ def _slide(centers: Floats, voxel_size: float, tool: Floats, count: int) -> Floa
 def write_along(
     folder: str | os.PathLike[str], url: str | os.PathLike[str], frames: int
 ) -> tuple[Path, Path]:
-    """Write wrench.stl, scaled to an environment, and path.csv that slides it over that."""
+    """Write spanner.stl, scaled to an environment, and path.csv that slides it over that."""
     home = Path(folder)
-    wrench = write_sample(home).wrench
+    tool = write_sample(home).spanner
     with hapticdb.open(url, read_only=True) as env:
         # the same share of the scene's length as of the sample car's
         bounds = np.array([obj.bounds for obj in env.objects()] or [np.zeros((2, 3))])
         longest = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
-        content = bytearray(wrench.read_bytes())
+        content = bytearray(tool.read_bytes())
         triangles = np.frombuffer(content, TRIANGLE, offset=HEADER)
         triangles["corners"][:] *= longest / SAMPLE_LENGTH or 1.0
-        wrench.write_bytes(content)
+        tool.write_bytes(content)
         # the shell's points, not the mesh: where only the mesh touches, no point would hit
-        poses = slide_along(env, PointShell.from_file(wrench).points, frames)
+        poses = slide_along(env, PointShell.from_file(tool).points, frames)
     write_poses(home / "path.csv", poses)
-    return wrench, home / "path.csv"
+    return tool, home / "path.csv"
 
 
 def slide_along(env: Environment, tool_points: Floats, frames: int) -> Floats:

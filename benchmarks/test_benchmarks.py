@@ -67,14 +67,14 @@ def test_the_evaluation_has_every_experiment_on_every_engine_and_layout(
 
 def test_cells_and_the_dense_bitmap_feel_the_same(database: Path, sample: SampleFiles) -> None:
     """`measure_frames` compares every bit itself."""
-    shell, poses = PointShell.from_file(sample.wrench, 3000), read_poses(sample.path)
+    shell, poses = PointShell.from_file(sample.spanner, 3000), read_poses(sample.path)
     found = in_real_time.measure_frames(database, shell, poses)
     assert found["hits"] > 0
     assert set(found["ratio"]) == {"flat", "session", "distance"}
 
 
 def test_edits_are_felt_and_taken_back(database: Path, sample: SampleFiles) -> None:
-    found = editing.edits(str(database), Path(sample.wrench), Path(sample.path), n_edits=2)
+    found = editing.edits(str(database), Path(sample.spanner), Path(sample.path), n_edits=2)
     assert (found["edits"], found["voxels"] > 0) == (2, True)
 
 

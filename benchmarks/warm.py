@@ -27,10 +27,10 @@ LONGEST_S = 600.0
 IMPORT = ("import", "car.db", "../car.glb", "--bits", "9", "--extent", "1.6")
 VERBS = {
     "info": ("info", "car.db"),
-    "touch": ("touch", "car.db", "--tool", "../wrench.stl", "--poses", "../path.csv"),
+    "touch": ("touch", "car.db", "--tool", "../spanner.stl", "--poses", "../path.csv"),
     "sweep": ("sweep", "car.db", "--part", "body/hood", "--path", "../up.csv"),
     "feel": (
-        "feel", "car.db", "--tool", "../wrench.stl", "--device", "../path.csv", "--seconds", "0.2",
+        "feel", "car.db", "--tool", "../spanner.stl", "--device", "../path.csv", "--seconds", "0.2",
     ),
 }  # fmt: skip
 UP = "x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0,0,0.3,1,0,0,0\n"

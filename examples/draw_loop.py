@@ -1,4 +1,4 @@
-"""Draws docs/loop.webp: the wrench slides over the car, the hood lifts out, a wheel is caught.
+"""Draws docs/loop.webp: the spanner slides over the car, the hood lifts out, a wheel is caught.
 
 Chromium draws the page's own scene; beside the packages of `make test` it needs /usr/bin/chromium*.
 """
@@ -54,7 +54,7 @@ UNSEEN = (
 )  # fmt: skip
 """Sub-assemblies under the skin: drawing them in software takes longer than all that is seen."""
 VIEWS = {
-    "wrench": ((3.0, -1.5, 2.1), (0.95, 0.1, 0.95)),
+    "spanner": ((3.0, -1.5, 2.1), (0.95, 0.1, 0.95)),
     "parts": ((4.4, 2.9, 2.2), (0.7, 0.2, 0.85)),
 }
 """Place of the eye, and what it looks at, metres."""
@@ -110,8 +110,8 @@ def _curve(picture: Image.Image, forces: Floats, now: int, top: float) -> Image.
     return picture
 
 
-def wrench(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
-    """Pictures of the wrench that slides under the distance law, with its force."""
+def spanner(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
+    """Pictures of the spanner that slides under the distance law, with its force."""
     shell = stage.env.tool(tool)
     poses = hapticdb.read_poses(path)[FIRST:LAST]
     felt = stage.env.touch(shell, poses=poses).forces
@@ -119,20 +119,20 @@ def wrench(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
     held = tools.from_files([str(tool)], stage.env.grid.voxel_size, has_distances=True)[0]
     scene = stage.client.scene
     node = scene.add_mesh_simple(
-        "/wrench", held.vertices, held.faces, color=(70, 76, 86), flat_shading=True, side="double"
+        "/spanner", held.vertices, held.faces, color=(70, 76, 86), flat_shading=True, side="double"
     )
     arrow = scene.add_arrows(
         "/arrow", np.zeros((1, 2, 3)), colours.FORCE, shaft_radius=0.02, head_radius=0.05,
         head_length=0.1,
     )  # fmt: skip
-    _look(stage, "wrench")
+    _look(stage, "spanner")
     for n in range(0, len(poses), STEP):
         place = poses[n][:3, 3]
         with stage.client.atomic():
             put_at(node, np.concatenate([place, quaternion_of(poses[n][None, :3, :3])[0]]))
             arrow.points = np.array([[place, place + felt[n] / NEWTONS_A_METRE]], dtype=np.float32)
         picture = _curve(_drawn(stage), forces, n, 1.1 * float(forces.max()))
-        yield _captioned(picture, "Feel: a wrench slides over the car")
+        yield _captioned(picture, "Feel: a spanner slides over the car")
     node.remove()
     arrow.remove()
 
@@ -206,7 +206,7 @@ def main() -> None:
             page.wait_for_timeout(1000)
             pictures, rests = [], []
             for scene in (
-                wrench(stage, files.wrench, files.path),
+                spanner(stage, files.spanner, files.path),
                 part(stage, ("hood*",), ("headlight*", "windscreen", "firewall"), 0.7, "hood"),
                 part(stage, ("wheels/*_front_left*",), (), 0.6, "wheel"),
             ):

@@ -1,4 +1,4 @@
-"""The sample: a car of closed, distinct parts that keep apart; a wrench; a path that touches."""
+"""The sample: a car of closed, distinct parts that keep apart; a spanner; a path that touches."""
 
 from pathlib import Path
 
@@ -25,9 +25,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SampleFiles:
 
 
 @pytest.fixture(scope="module")
-def wrench(files: SampleFiles) -> Floats:
-    """Vertices (V, 3) of the wrench, metres."""
-    return np.asarray(trimesh.load_mesh(files.wrench).vertices)
+def spanner(files: SampleFiles) -> Floats:
+    """Vertices (V, 3) of the spanner, metres."""
+    return np.asarray(trimesh.load_mesh(files.spanner).vertices)
 
 
 def moved_points(points: Floats, poses: Floats) -> Floats:
@@ -67,18 +67,18 @@ def test_clashes_finds_the_two_planted_overlaps_and_the_rules_leave_one(
     assert left == {("frame/cross_member_middle", "supply/fuel_line")}
 
 
-def test_the_wrench_is_one_closed_piece(files: SampleFiles) -> None:
-    mesh = trimesh.load_mesh(files.wrench)
+def test_the_spanner_is_one_closed_piece(files: SampleFiles) -> None:
+    mesh = trimesh.load_mesh(files.spanner)
     assert mesh.is_volume
     assert mesh.body_count == 1
     assert mesh.extents == pytest.approx([0.25, 0.054, 0.010], abs=0.003)
 
 
-def test_the_path_is_smooth_and_comes_down_from_above(files: SampleFiles, wrench: Floats) -> None:
+def test_the_path_is_smooth_and_comes_down_from_above(files: SampleFiles, spanner: Floats) -> None:
     poses = read_poses(files.path)
     assert len(poses) == 1000
     assert_rigid(poses)
-    steps = np.diff(moved_points(wrench, poses), axis=0)
+    steps = np.diff(moved_points(spanner, poses), axis=0)
     assert np.linalg.norm(steps, axis=2).max() < 0.010
     assert steps[:20, :, 2].mean() < 0.0
 

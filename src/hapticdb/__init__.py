@@ -14,7 +14,7 @@ Errors are in `hapticdb.errors`.
 
 >>> import hapticdb
 >>> env = hapticdb.open("car.db")                             # doctest: +SKIP
->>> env.touch(env.tool("wrench.stl"), pose).force             # doctest: +SKIP
+>>> env.touch(env.tool("spanner.stl"), pose).force             # doctest: +SKIP
 """
 
 from importlib import import_module

@@ -127,7 +127,7 @@ def prepare(
     options = GridOptions(bits=bits)
     home = Path(folder)
     files = write_sample(home, frames)
-    shell = PointShell.from_file(files.wrench, points)
+    shell = PointShell.from_file(files.spanner, points)
     layouts: tuple[tuple[Layout, str], ...] = (("brick", "car.db"), ("voxel", "car_voxel.db"))
     imported = [
         _import(str(home / name), files.car, layout, options, progress) for layout, name in layouts

@@ -63,7 +63,7 @@ VERBS: dict[Callable[..., None], str] = {
     backup: "Copy an SQLite environment into a file, whole.",
     grant: "Give a role rights, on PostgreSQL.",
     demo: "Make, import, touch and draw the sample.",
-    sample: "Write a sample: a car, a wrench and its path.",
+    sample: "Write a sample: a car, a spanner and its path.",
 }
 """Verbs, each with its line in the list of verbs."""
 HIDDEN = {sample}

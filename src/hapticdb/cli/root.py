@@ -107,7 +107,7 @@ def root(
     \b
       hapticdb demo
       hapticdb import car.db car.glb --bits 11
-      hapticdb touch car.db --tool wrench.stl --poses path.csv
+      hapticdb touch car.db --tool spanner.stl --poses path.csv
 
     A URL instead of a path opens an environment on PostgreSQL:
     'postgresql://user@host/database?environment=NAME'.

@@ -53,7 +53,7 @@ def _compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> 
     parts = [(obj, part.surface()) for obj, part in parts_of(env.store, objects)]
     tints = [np.tile(_rgb(colors.get(obj.id, BODY)), (len(faces), 1)) for obj, faces in parts]
     canvas.fill(np.concatenate([faces for _, faces in parts]), np.concatenate(tints))
-    tool = np.concatenate([part.triangles() for part in read_file(scene.files.wrench).parts])
+    tool = np.concatenate([part.triangles() for part in read_file(scene.files.spanner).parts])
     for index in np.linspace(0, len(scene.poses) - 1, TOOLS_SHOWN).astype(int):
         pose = scene.poses[index]
         canvas.fill(tool @ pose[:3, :3].T + pose[:3, 3], _rgb(TOOL))

@@ -1,4 +1,4 @@
-"""The sample as files: car.glb, wrench.stl, path.csv and rules.toml."""
+"""The sample as files: car.glb, spanner.stl, path.csv and rules.toml."""
 
 import lzma
 import os
@@ -15,7 +15,7 @@ class SampleFiles(NamedTuple):
     """Paths of the written files."""
 
     car: Path
-    wrench: Path
+    spanner: Path
     path: Path
     rules: Path
 
@@ -48,14 +48,13 @@ def _write(path: Path, content: bytes) -> Path:
 
 
 def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFiles:
-    """Write car.glb, wrench.stl, path.csv and rules.toml into a folder, made when missing.
+    """Write car.glb, spanner.stl, path.csv and rules.toml into a folder, made when missing.
 
-    The path slides the wrench over hood, windscreen, roof, rear window and boot. It comes down from
-    above. Then its deepest point is 1 mm below the surface, so it is in contact at any voxel size
-    of the imported car. `count` of its poses are written, evenly spread; UsageError if the path has
-    fewer.
+    The path comes down from above, then slides the spanner over hood, windscreen, roof, rear window
+    and boot. Its deepest point is 1 mm below the surface: a contact at any voxel size of the
+    imported car. `count` of its poses are written, evenly spread; UsageError if the path has fewer.
 
-    The wrench is 0.25 m long: its handle lies along x with the ring at +x, the flat sides towards
+    The spanner is 0.25 m long: its handle lies along x with the ring at +x, the flat sides towards
     -z and +z, the origin halfway along and halfway through.
     """
     header, *poses = _content("path.csv").splitlines(keepends=True)
@@ -69,7 +68,7 @@ def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFil
     chosen = np.linspace(0, len(poses) - 1, count).round().astype(np.int64)
     return SampleFiles(
         _write(target / "car.glb", _content("car.glb")),
-        _write(target / "wrench.stl", _content("wrench.stl")),
+        _write(target / "spanner.stl", _content("spanner.stl")),
         _write(target / "path.csv", header + b"".join(poses[index] for index in chosen)),
         _write(target / "rules.toml", RULES.encode()),
     )

@@ -112,7 +112,7 @@ def feel(
 ) -> None:
     """Feel an environment in real time with a device, then report the timing of the frames.
 
-    Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
+    Example: hapticdb feel car.db --tool spanner.stl --device path.csv --rate 1000 --seconds 10
     """
     began = perf_counter()
     rendering = _begin_loop(force, loop)

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 def sample(folder: Path, *, frames: int = 1000) -> None:
-    """Write sample files: car.glb, wrench.stl, path.csv, rules.toml.
+    """Write sample files: car.glb, spanner.stl, path.csv, rules.toml.
 
-    The path slides the wrench over the car; the rules leave one clash of its parts open.
+    The path slides the spanner over the car; the rules leave one clash of its parts open.
 
     Example: hapticdb sample sample
     """

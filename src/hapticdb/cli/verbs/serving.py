@@ -73,7 +73,7 @@ class ReachOptions:
 def view(url: str, *, page: PageOptions, no_browser: bool = False) -> None:
     """See and feel an environment in a browser on this machine.
 
-    Example: hapticdb view car.db --tool wrench.stl
+    Example: hapticdb view car.db --tool spanner.stl
     """
     _check_extra()
     from hapticdb.server.access import Role, make_token
@@ -102,7 +102,7 @@ def serve(
 ) -> None:
     """Let others see and feel an environment in browsers.
 
-    Example: hapticdb serve car.db --tool wrench.stl --token
+    Example: hapticdb serve car.db --tool spanner.stl --token
     """
     _check_extra()
     tokens = _tokens(token_file, are_made=token)

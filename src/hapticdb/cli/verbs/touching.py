@@ -79,7 +79,7 @@ def touch(
 ) -> None:
     """Touch an environment with a tool along a path: force, torque, objects at every pose.
 
-    Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
+    Example: hapticdb touch car.db --tool spanner.stl --poses path.csv --json
     """
     import hapticdb
     from hapticdb.query.law import law_named

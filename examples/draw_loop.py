@@ -1,4 +1,4 @@
-"""Draws docs/loop.webp: the spanner slides over the car, the hood lifts out, a wheel is caught.
+"""Draws docs/loop.webp: the trunk lid comes out, a wheel is caught, a spanner slides over the car.
 
 Chromium draws the page's own scene; beside the packages of `make test` it needs /usr/bin/chromium*.
 """
@@ -46,6 +46,8 @@ STRIP = 84
 """Height of the strip with the curve, pixels."""
 NEWTONS_A_METRE = 90.0
 """Force whose arrow is a metre long. Larger: shorter arrows."""
+UP = 0.6
+"""Metres that the wheel is pushed up."""
 FREE: colours.Colour = (58, 160, 92)
 CAUGHT: colours.Colour = (214, 52, 58)
 INK = (36, 44, 56)
@@ -55,7 +57,8 @@ UNSEEN = (
 """Sub-assemblies under the skin: drawing them in software takes longer than all that is seen."""
 VIEWS = {
     "spanner": ((3.0, -1.5, 2.1), (0.95, 0.1, 0.95)),
-    "parts": ((4.4, 2.9, 2.2), (0.7, 0.2, 0.85)),
+    "front": ((4.4, 2.9, 2.2), (0.7, 0.2, 0.85)),
+    "rear": ((-5.2, 2.7, 2.3), (-1.3, 0.2, 0.75)),
 }
 """Place of the eye, and what it looks at, metres."""
 
@@ -119,7 +122,12 @@ def spanner(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
     held = tools.from_files([str(tool)], stage.env.grid.voxel_size, has_distances=True)[0]
     scene = stage.client.scene
     node = scene.add_mesh_simple(
-        "/spanner", held.vertices, held.faces, color=(70, 76, 86), flat_shading=True, side="double"
+        "/spanner",
+        held.vertices,
+        held.faces,
+        color=colours.of_tool(0),
+        flat_shading=True,
+        side="double",
     )
     arrow = scene.add_arrows(
         "/arrow", np.zeros((1, 2, 3)), colours.FORCE, shaft_radius=0.02, head_radius=0.05,
@@ -137,32 +145,45 @@ def spanner(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
     arrow.remove()
 
 
-def part(
-    stage: _Stage, words: tuple[str, ...], exclude: tuple[str, ...], up: float, name: str
+def moving(
+    stage: _Stage, ids: list[int], poses: Floats, colour: colours.Colour, text: str, view: str
 ) -> Iterator[Image.Image]:
-    """Pictures of parts that move up by so many metres, as far as they are free."""
-    way = np.array([0.0, 0.0, up])
-    env, ids = stage.env, [obj.id for word in words for obj in stage.env.find(word)]
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, :3, 3] = way
-    swept = hapticdb.sweep(env, env.shell(*ids), poses, exclude=[*ids, *exclude], seated=True)
-    hit = min((place.fraction for place in swept.hits), default=None)
-    colour = FREE if hit is None else CAUGHT
-    far = 1.0 if hit is None else float(hit)
-    stage.looks.show(obj.id for obj in env.find("engine/*"))
+    """Pictures of parts on the straight way between two displacements (2, 4, 4)."""
     stage.looks.colour(ids, colour)
-    _look(stage, "parts")
-    text = f"Sweep: the {name} comes out"
-    if swept.hits:
-        text = f"Sweep: the {name} is caught by {swept.hits[0].object.name.rpartition('/')[2]}"
-    objects = {i: env.object(i).transform for i in ids}
+    _look(stage, view)
+    starts = {i: stage.env.object(i).transform for i in ids}
     for share in 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, LIFTS)):
-        for object_id, start in objects.items():
+        for object_id, start in starts.items():
             moved = start.copy()
-            moved[:3, 3] += share * far * way
+            moved[:3, 3] += share * (poses[-1, :3, 3] - poses[0, :3, 3])
             stage.view.move(object_id, moved)
-        yield _captioned(_drawn(stage), text.replace("_", " "), colour)
+        yield _captioned(_drawn(stage), text, colour)
+    for object_id, start in starts.items():
+        stage.view.move(object_id, start)
     stage.looks.hide(ids)
+
+
+def lid(stage: _Stage) -> Iterator[Image.Image]:
+    """Pictures of the trunk lid on its removal path."""
+    found = hapticdb.extract(stage.env, "body/trunk_lid")
+    if found.way is None:
+        raise SystemExit("the trunk lid does not come out")
+    ids = [obj.id for obj in found.parts]
+    text = f"Extract: the trunk lid comes out, {found.way.length:.2f} m, proved"
+    yield from moving(stage, ids, found.way.poses, FREE, text, "rear")
+
+
+def wheel(stage: _Stage) -> Iterator[Image.Image]:
+    """Pictures of a wheel that is pushed up, as far as it is free."""
+    env, ids = stage.env, [obj.id for obj in stage.env.find("wheels/*_front_left*")]
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 2, 3] = UP
+    first = hapticdb.sweep(env, env.shell(*ids), poses, exclude=ids, seated=True).hits[0]
+    poses[1, 2, 3] *= first.fraction
+    name = first.object.name.rpartition("/")[2].replace("_", " ")
+    yield from moving(
+        stage, ids, poses, CAUGHT, f"Sweep: the wheel is caught by the {name}", "front"
+    )
 
 
 def main() -> None:
@@ -206,9 +227,9 @@ def main() -> None:
             page.wait_for_timeout(1000)
             pictures, rests = [], []
             for scene in (
+                lid(stage),
+                wheel(stage),
                 spanner(stage, files.spanner, files.path),
-                part(stage, ("hood*",), ("headlight*", "windscreen", "firewall"), 0.7, "hood"),
-                part(stage, ("wheels/*_front_left*",), (), 0.6, "wheel"),
             ):
                 shown = list(scene)
                 pictures += shown

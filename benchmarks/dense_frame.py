@@ -8,7 +8,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS32, WORDS32_2, entry, leaf
+from hapticdb.kernels._jit import FLOATS3, INT, INTS, INTS32, WORDS32_2, entry, leaf, record_of
 from hapticdb.kernels.law import (
     NO_WRENCH,
     NOTHING_NEAR,
@@ -18,15 +18,8 @@ from hapticdb.kernels.law import (
     respond,
 )
 from hapticdb.kernels.query.contact import center_of
-from hapticdb.kernels.resident.cells import (
-    CLUSTERS,
-    CONTACTS,
-    DEEPEST,
-    EMPTY_SLOT,
-    HITS,
-    PLACE,
-    Cells,
-)
+from hapticdb.kernels.records.hand import RESULT
+from hapticdb.kernels.resident.cells import CLUSTERS, EMPTY_SLOT, PLACE, Cells
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 
@@ -77,15 +70,13 @@ def dense_felt(bitmap, shell, pose, place, law, met, out):  # type: ignore[no-un
             n_contacts += 1
             deepest = max(deepest, depth)
             sums = accumulate(sums, point, center, depth, law.stiffness)
-    average_into(out, weight, sums)
-    out[HITS] = count
-    out[CONTACTS] = n_contacts
-    out[DEEPEST] = deepest
+    average_into(out.wrench, weight, sums)
+    out.hits, out.contacts, out.deepest = count, n_contacts, deepest
 
 
-@entry(types.uint32[::1], CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, FLOATS2)
+@entry(types.uint32[::1], CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, record_of(RESULT, 1))
 def dense_feel(bitmap, shell, poses, place, law, met, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
-    """`dense_felt` at poses (M, 4, 4) into out (M, RESULTS), as `feel_kernel` does."""
+    """`dense_felt` at poses (M, 4, 4) into out (M,) of RESULT, as `feel_kernel` does."""
     for n in range(poses.shape[0]):
         if not is_rigid(poses[n]):
             return n

@@ -31,7 +31,8 @@ from awake import awake
 from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
-from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
+from hapticdb.kernels.records.cells import BUFFERS
+from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query.law import DistanceField
@@ -93,7 +94,7 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
         with table.reading() as row, awake():
             for _ in range(ROUNDS + 1):
                 for name, spent in times.items():
-                    out = np.zeros((len(poses), RESULTS))
+                    out = np.zeros(len(poses), RESULT)
                     started = time.perf_counter()
                     if name == "dense":
                         place, hits = residency.place, first.hits

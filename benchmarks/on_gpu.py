@@ -30,7 +30,7 @@ from hapticdb.batches.feeler import Feeler
 from hapticdb.batches.on_gpu import GpuFrames
 from hapticdb.devices.scripted import Player
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.kernels.resident.cells import RESULTS
+from hapticdb.kernels.records.hand import RESULT
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
 from slide_paths import write_along
@@ -92,7 +92,7 @@ def percentiles(seconds: list[float]) -> dict[str, float]:
 
 
 def results_of(gpu: GpuFrames, poses: Floats) -> Floats:
-    """Results (B, RESULTS) of frames on the GPU, in the order of the processor's."""
+    """Results (B, 10) of frames on the GPU, in the order of the processor's."""
     return np.concatenate([
         np.hstack([found.forces, found.torques, np.stack(found[2:], axis=1)])
         for _, found in gpu.run(poses)
@@ -101,9 +101,9 @@ def results_of(gpu: GpuFrames, poses: Floats) -> Floats:
 
 def on_processor(feeler: Feeler, poses: Floats) -> Floats:
     """The same of frames on the processor, in one thread."""
-    frames, out = feeler._frames, np.zeros((len(poses), RESULTS))  # noqa: SLF001 - measured
+    frames, out = feeler._frames, np.zeros(len(poses), RESULT)  # noqa: SLF001 - measured
     frames._run(poses, out, 0, len(poses))  # noqa: SLF001
-    return out
+    return out.view(np.float64).reshape(len(poses), -1)
 
 
 def compared(feeler: Feeler, gpu: GpuFrames, poses: Floats) -> dict[str, Any]:

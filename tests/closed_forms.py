@@ -10,9 +10,9 @@ from bands import steps_of
 from hapticdb.grid import Grid
 from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, HALF_WIDTH, STEPS
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.records import SESSION, pose_numbers, views_of
+from hapticdb.kernels.records.cells import CONTROL, READER, REQUEST
+from hapticdb.kernels.records.layout import pose_numbers, views_of
 from hapticdb.kernels.resident.cells import (
-    READER_STRIDE,
     SCRATCH_ROWS,
     Cells,
     Clusters,
@@ -127,11 +127,11 @@ def field_of(distance: Distance, size: float, n_cells: ArrayLike = (2, 2, 2)) ->
             masks.append(mask_of(values))
         enter(keys, slots, key_of_cell(*(int(n) for n in at)), slot)
     keys[1:], slots[1:] = keys[0], slots[0]
-    control = np.zeros(16, dtype=np.int64)
-    control[0] = 3
+    control = np.zeros((), CONTROL)
+    control["version"] = 3
     near = np.zeros((len(payload), 1024), dtype=np.uint32)
     cells = Cells(
-        control, np.zeros(16 * READER_STRIDE, dtype=np.int64), keys, slots, np.array(words),
+        control, np.zeros(16, READER), keys, slots, np.array(words),
         np.array(masks, dtype=np.uint64), np.zeros(len(payload), dtype=np.uint8),
         np.array(payload), near,
     )  # fmt: skip
@@ -203,10 +203,11 @@ class Hand:
         self.spring = SPRING._replace(radius=radius)._replace(**spring)
         self._periods = PeriodClock(DISTANCE)
         self._state = SessionState(
-            self._periods.rows, field.cells, 0, np.zeros((), SESSION), Grid(1.0, (0, 0, 0), 6), tool
-        )
-        row = self._state.row
-        row["place"], row["is_running"] = field.place, 1
+            self._periods.slots[0, ...], field.cells, 0, np.zeros((), REQUEST),
+            Grid(1.0, (0, 0, 0), 6), tool,
+        )  # fmt: skip
+        self._state.slot["place"] = field.place
+        self._periods.enter(self._state)
         self._state.set_spring(self.spring)
         self._state.rest_at(np.concatenate([position, quaternion]))
         self.servo, self.follower = self._state.servo, self._state.follower

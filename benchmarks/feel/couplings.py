@@ -13,7 +13,7 @@ from feel.ground import Ground
 from hapticdb.devices.handle import Handle
 from hapticdb.devices.protocol import Reading
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.records import pose_numbers
+from hapticdb.kernels.records.layout import pose_numbers
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE
 from hapticdb.resident.held import clusters_of
@@ -56,7 +56,7 @@ class CoupledHand:
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
         self._periods = PeriodClock(DISTANCE)
         self._state = SessionState(
-            self._periods.rows, ground.table.cells, 0, ground.table.queue.sessions[0, ...],
+            self._periods.slots[0, ...], ground.table.cells, 0, ground.table.queue.requests[0, ...],
             ground.residency.grid, clusters_of(shell, ground.size),
         )  # fmt: skip
         self._hand, self._sent = self._state.servo["hand"], self._state.servo["sent"]
@@ -78,7 +78,7 @@ class CoupledHand:
             fade=0.02,
         )
         self._state.set_spring(spring)
-        self._state.row["is_running"] = True
+        self._periods.enter(self._state)
         self._state.row["staleness"] = np.iinfo(np.int64).max
         for _ in range(round(REST / (self._period * RATE))):
             self.step(pose, np.zeros(6))

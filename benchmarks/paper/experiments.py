@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from dense_frame import dense_bitmap, dense_feel
 from hapticdb import Environment, Query
-from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
+from hapticdb.kernels.records.cells import BUFFERS
+from hapticdb.kernels.records.hand import RESULT
 from hapticdb.paper.grouping import cbgroup
 from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.paper.strategies import Strategy
@@ -174,7 +175,7 @@ def in_memory(env: Environment, tasks: Sequence[Task], budget: Budget) -> list[C
 
 def _against(bitmap: NDArray[np.uint32], frames: ResidentFrames) -> Callable[[Floats], Query]:
     """Frames against a bitmap; nothing is asked."""
-    out, place = np.zeros((1, RESULTS)), frames.residency.place
+    out, place = np.zeros(1, RESULT), frames.residency.place
 
     def frame(pose: Floats) -> Query:
         dense_feel(bitmap, frames.clusters, pose[None], place, frames.law, frames.hits, out)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import GridError
 from hapticdb.kernels import curves
-from hapticdb.kernels.records import GRID
+from hapticdb.kernels.records.rows import GRID
 from hapticdb.units import length_text, place_text
 
 CurveName = Literal["z", "hilbert", "lexicographic"]
@@ -80,7 +80,7 @@ class Grid:
         return CURVE_CODES[self.curve]
 
     def for_kernels(self, shift: int) -> NDArray[np.void]:
-        """Record () of `kernels.records.GRID`, for rows whose keys are shifted by so many bits."""
+        """Record () of `records.rows.GRID`, for rows whose keys are shifted by so many bits."""
         numbers = (*self.origin, self.voxel_size, self.side, self.bits, self.curve_code, shift)
         return np.array(numbers, GRID)
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from hapticdb.devices.handle import Hand, Handle
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import UsageError
-from hapticdb.kernels.records import HAND, pose_numbers
+from hapticdb.kernels.records.hand import HAND
+from hapticdb.kernels.records.layout import pose_numbers
 from hapticdb.poses import poses_of
 from session.worlds import turned
 

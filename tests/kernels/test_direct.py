@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.direct import render
 from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD, RISE_FRAMES
-from hapticdb.kernels.records import RESULTS, SERVO, views_of
-from hapticdb.kernels.resident.cells import HITS, UNKNOWNS, WRENCH
+from hapticdb.kernels.records.hand import RESULT, SERVO
+from hapticdb.kernels.records.layout import views_of
 from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
@@ -32,12 +32,11 @@ class Tool:
         self.tool, self.hand, self.sent = views.tool, views.hand, views.sent
         self.hand.position[:] = (0.1, 0.2, 0.3)
         self.hand.quaternion[:] = (0.8, 0.0, 0.6, 0.0)
-        self.felt = np.zeros(RESULTS)
+        self.felt = np.zeros((), RESULT)
 
     def feel(self, wrench: ArrayLike, unknown: int = 0) -> None:
-        self.felt[WRENCH : WRENCH + 6] = wrench
-        self.felt[HITS], self.felt[UNKNOWNS] = 3, unknown
-        render(TERMS, CENTER, self.servo[()], self.felt, DT)
+        self.felt["wrench"], self.felt["hits"], self.felt["unknown"] = wrench, 3, unknown
+        render(TERMS, CENTER, self.servo[()], self.felt[()], DT)
 
     def feel_long(self, wrench: ArrayLike, unknown: int = 0) -> Floats:
         """Wrench at the device after a time in which forces rise or fall to their end."""
@@ -59,7 +58,7 @@ def test_the_device_gets_the_frame_s_wrench_up_to_its_caps(wrench: list[float]) 
     expected = np.concatenate([force, (torque + np.cross(lever, force)) / TERMS.scale])
     np.testing.assert_allclose(found, expected, atol=1e-12)
     assert np.linalg.norm(found[:3]) <= TERMS.cap * (1.0 + 1e-12)
-    assert tool.tool.felt[WRENCH : WRENCH + 6].tolist() == wrench  # what is recorded has no cap
+    assert tool.tool.felt.wrench.tolist() == wrench  # what is recorded has no cap
     assert (int(tool.sent.hits), int(tool.sent.marks)) == (3, 0)
 
 

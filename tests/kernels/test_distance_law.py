@@ -15,7 +15,8 @@ from hapticdb.grid import CurveName
 from hapticdb.kernels.field import law as field
 from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, HALF_WIDTH, STEPS
 from hapticdb.kernels.query import refining
-from hapticdb.kernels.records import MOST_MISSED
+from hapticdb.kernels.records.cells import CONTROL, MISSED, READER
+from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident import cells as resident
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
@@ -179,17 +180,19 @@ def cells_of(scene: Merged, exclude: tuple[int, ...]) -> resident.Cells:
     near = np.zeros_like(words)
     mark_near_voxels(np.arange(1, 1 + n_cells), payload, masks, words, near)
     return resident.Cells(
-        np.ones(16, dtype=np.int64), np.zeros(128, dtype=np.int64), keys, slots, words, masks,
+        np.ones((), CONTROL), np.zeros(16, READER), keys, slots, words, masks,
         np.zeros(1 + n_cells, dtype=np.uint8), payload, near,
     )  # fmt: skip
 
 
-def on_cells(cells: resident.Cells, shell: PointShell, pose: Array, run: int | None) -> Array:
-    """Result (RESULTS,) of a frame on resident cells."""
-    out, met = np.zeros((1, resident.RESULTS)), np.empty(len(shell), dtype=np.int64)
+def on_cells(
+    cells: resident.Cells, shell: PointShell, pose: Array, run: int | None
+) -> NDArray[np.void]:
+    """RESULT of a frame on resident cells."""
+    out, met = np.zeros(1, RESULT), np.empty(len(shell), dtype=np.int64)
     place = resident.Place(*ORIGIN, SIZE, float(1 << BITS))
     clusters = clusters_of(shell, SIZE, run)
-    missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+    missed = np.zeros((), MISSED)
     feel_kernel(cells, 0, clusters, pose[None], place, LAW, met, missed, out)
     return out[0]  # type: ignore[no-any-return]
 
@@ -224,10 +227,10 @@ def test_rows_and_cells_feel_what_plain_python_feels(
     for run in (0, 4, 64):
         if cells is not None:
             result = on_cells(cells, shell, pose, run)
-            assert result[:6].tolist() == wrench.tolist()
-            assert result[resident.HITS] == len(hits)
-            assert result[resident.CONTACTS] == len(wanted.contacts)
-            assert result[resident.DEEPEST] == max(wanted.contact_depths.values(), default=0.0)
+            assert result["wrench"].tolist() == wrench.tolist()
+            assert result["hits"] == len(hits)
+            assert result["contacts"] == len(wanted.contacts)
+            assert result["deepest"] == max(wanted.contact_depths.values(), default=0.0)
 
 
 def test_the_scene_has_hits_contacts_and_free_points() -> None:

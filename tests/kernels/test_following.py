@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticdb.kernels.period.following import LONGEST_GAP_NS, STRETCH, follow_arrivals
-from hapticdb.kernels.records import HAND, SEAT, STATION
+from hapticdb.kernels.records.hand import HAND
+from hapticdb.kernels.records.session import SLOT
 
 MS = 1_000_000
 """Nanoseconds of a millisecond."""
@@ -18,20 +19,20 @@ class Followed:
     """A hand that starts at x = 0 and is told where to go."""
 
     def __init__(self, gap_ms: float) -> None:
-        self.station, self.seat = np.zeros(1, STATION)[0], np.zeros(1, SEAT)[0]
+        self.slot = np.zeros(1, SLOT)[0]
         self.hand = np.zeros(1, HAND)[0]
-        self.station.gap = round(gap_ms * MS)
-        self.station.way.seconds = 1e-9
-        for pose in (self.hand.quaternion, self.station.way.start[3:], self.station.way.end[3:]):
+        self.slot.gap = round(gap_ms * MS)
+        self.slot.segment.seconds = 1e-9
+        for pose in (self.hand.quaternion, self.slot.segment.start[3:], self.slot.segment.end[3:]):
             pose[0] = 1.0
 
     def arrive(self, now: int, x: float, *, is_held: bool = True, turn: float = 0.0) -> None:
-        self.seat.hand_pose[:] = (x, 0.0, 0.0, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
-        self.seat.hand_time, self.seat.is_held = now, is_held
-        self.seat.hand_sequence += 2
+        self.slot.hand_pose[:] = (x, 0.0, 0.0, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
+        self.slot.hand_time, self.slot.is_held = now, is_held
+        self.slot.hand_sequence += 2
 
     def at(self, now: int) -> float:
-        follow_arrivals(self.station, self.seat, self.hand, now)
+        follow_arrivals(self.slot, self.hand, now)
         return float(self.hand.position[0])
 
 
@@ -84,8 +85,8 @@ def test_a_hand_that_let_go_is_nowhere_and_takes_the_tool_again_where_it_is_then
 def test_a_pose_that_is_being_written_is_taken_later() -> None:
     hand = Followed(gap_ms=40.0)
     hand.arrive(1000 * MS, 0.01)
-    hand.seat.hand_sequence += 1
+    hand.slot.hand_sequence += 1
     assert hand.at(1100 * MS) == 0.0
-    hand.seat.hand_sequence += 1
+    hand.slot.hand_sequence += 1
     hand.at(1100 * MS)
     assert hand.at(1200 * MS) == pytest.approx(0.01)

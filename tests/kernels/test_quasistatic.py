@@ -257,7 +257,7 @@ def test_a_tool_stays_before_unknown_cells_and_its_force_fades() -> None:
         hand.move([0.0, 0.2, 0.004])
         assert hand.sent.unknown > 0
         assert hand.sent.marks & IS_HELD
-        assert hand.missed[0] > 0
+        assert hand.missed["n_cells"] > 0
     assert hand.sent.wrench[2] == before
     hand.rest(60)
     assert (hand.sent.wrench == 0.0).all()

@@ -15,7 +15,7 @@ from children import PATIENCE, finished, until
 from hapticdb import Environment, Touch
 from hapticdb.errors import DamagedError, UsageError
 from hapticdb.grid import CurveName
-from hapticdb.kernels import records
+from hapticdb.kernels.records import rows as records
 from hapticdb.query.bricks import BrickMemory
 from hapticdb.query.law import LawName
 from hapticdb.store.base import Band, Keys, Rows

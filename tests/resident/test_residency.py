@@ -17,7 +17,8 @@ from children import joined
 from hapticdb import Environment, PointShell
 from hapticdb.errors import UsageError
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.kernels.resident.cells import BUFFERS, READER_STRIDE, UNKNOWN, cell_key
+from hapticdb.kernels.records.cells import BUFFERS
+from hapticdb.kernels.resident.cells import UNKNOWN, cell_key
 from hapticdb.resident import changes
 from hapticdb.resident import residency as module
 from hapticdb.resident.residency import Residency
@@ -340,13 +341,13 @@ def test_a_reader_that_died_in_a_frame_holds_the_writer_up_for_a_moment_only(
     residency = Residency(env.store, table)
     row = table.join()
     table.queue.pids[row] = 2**22 + 1  # above the largest process id
-    table.cells.readers[row * READER_STRIDE] = table.version
+    table.cells.readers["version"][row] = table.version
     cells = cells_of(env.grid)
     for at in range(0, 400, 50):
         for _ in range(ROUNDS_KEPT + 1):
             residency.begin_round()
         residency.load(cells[at : at + 50])
-    assert table.cells.readers[row * READER_STRIDE] == 0
+    assert table.cells.readers["version"][row] == 0
     check(residency, voxels_by_cell(env))
 
 

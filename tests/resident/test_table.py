@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from children import PATIENCE, child, joined, until
 from hapticdb.errors import UsageError
-from hapticdb.kernels.resident.cells import READER_STRIDE
 from hapticdb.resident.table import LEAST_BUDGET, MOST_READERS, CellTable, is_alive
 
 
@@ -75,7 +74,7 @@ def test_a_row_says_nothing_of_who_had_it_before() -> None:
     """Nothing is left even if the former reader ended in the middle of a write."""
     with CellTable.create(LEAST_BUDGET) as table:
         row = table.join()
-        sessions = table.queue.sessions
+        sessions = table.queue.requests
         sessions[row] = 3  # sets all fields of the row
         sessions["sequence"][row] = 5
         table.leave(row)
@@ -91,11 +90,11 @@ def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
         until(lambda: not is_alive(gone.pid))  # the process is a zombie
         dead, alive = table.join(), table.join()
         table.queue.pids[dead] = gone.pid
-        table.cells.readers[[dead * READER_STRIDE, alive * READER_STRIDE]] = 9
-        is_active = table.queue.sessions["told"]["is_active"]
+        table.cells.readers["version"][[dead, alive]] = 9
+        is_active = table.queue.requests["prefetch"]["is_active"]
         is_active[[dead, alive]] = True
         table.release_dead()
-        assert np.flatnonzero(table.cells.readers).tolist() == [alive * READER_STRIDE]
+        assert np.flatnonzero(table.cells.readers["version"]).tolist() == [alive]
         assert np.flatnonzero(is_active).tolist() == [alive]
         assert table.join() not in {dead, alive}
     assert not is_alive(gone.pid)

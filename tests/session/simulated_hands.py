@@ -125,16 +125,17 @@ def unknown_is_never_empty_and_what_changes_is_felt() -> None:
     assert not pair.hands[1].sent.wrench.any()
     which = np.flatnonzero(cells.keys[1] == key_of_cell(1, 1, 1))[0]
     cells.slots[1, which] = UNKNOWN
-    cells.control[0] = 4
+    cells.control["version"] = 4
     pair.move(place)
     for hand in pair.hands:
         assert hand.sent.unknown == 4
-        assert hand.missed[:2].tolist() == [1, cells.keys[1, which]]
+        assert hand.missed["n_cells"] == 1
+        assert hand.missed["cells"][0] == cells.keys[1, which]
     raised = field_of(moved(plane([0.0, 0.0, 1.0]), [0.0, 0.0, 0.7 * SIZE]), SIZE).cells.payload
     assert cells.payload is not None
     assert raised is not None
     cells.payload[:] = raised
-    pair.table.filled[:] = cells.control[0] = 5
+    pair.table.filled[:] = cells.control["version"] = 5
     for n in range(4):
         pair.move([0.0, 0.0, (2.5 - 0.3 * n) * SIZE])
     assert pair.hands[1].sent.unknown == 0

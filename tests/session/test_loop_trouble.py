@@ -22,7 +22,7 @@ from hapticdb.errors import DeviceError
 from hapticdb.kernels.period.loop import WITHDRAWN_NS
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.table import HEARTBEAT, CellTable
+from hapticdb.resident.table import CellTable
 from hapticdb.session import device_loop as subject
 from hapticdb.session.coupling import Coupling, DirectRendering, rendering_of
 from hapticdb.session.device_loop import DeviceLoop, DeviceRequest
@@ -110,9 +110,9 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
     class Leaving(Pressing):
         def apply(self, wrench: Floats) -> None:
             super().apply(wrench)
-            world.table.cells.control[HEARTBEAT] = time.monotonic_ns() + 2 * WITHDRAWN_NS
+            world.table.cells.control["heartbeat"] = time.monotonic_ns() + 2 * WITHDRAWN_NS
             if wrench.any():
-                self.n_asked = int(world.table.queue.sessions["n_asked"].max())
+                self.n_asked = int(world.table.queue.requests["n_asked"].max())
             self.z = -0.004 if 5 < len(self.sent) <= 30 else 0.02
 
         @property
@@ -123,7 +123,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
     work(requested(world, hand, seconds=60.0), Heard())
     assert hand.n_asked > 0
     assert not hand.sent[-1].any()
-    assert not world.table.queue.sessions["n_asked"].any()
+    assert not world.table.queue.requests["n_asked"].any()
 
 
 def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
@@ -134,11 +134,13 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> 
     clock = PeriodClock(request.law, shared.slots, shared.rings, request.rendering)
     loop = DeviceLoop(request.alone, request.timing, clock)
     loop.warm_up()
-    assert loop.tool["felt"].any() or world.table.has_distances  # there the tool lies in the floor
+    assert (
+        loop.tool["felt"]["wrench"].any() or world.table.has_distances
+    )  # there the tool lies in the floor
     hand.z = 0.02
     loop._place()
-    loop.state.row["staleness"] = -(10**18)
-    loop.state.row["is_frame"] = True
+    loop.slot["staleness"] = -(10**18)
+    loop.slot["is_frame"] = True
     loop._step(1e-3)
     noted = shared.rings[0, 0]
     assert noted["hits"] == shared.slots["hit_frames"][0] == 0

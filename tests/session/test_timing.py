@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.records import TIME_BINS
+from hapticdb.kernels.records.session import TIME_BINS
 from hapticdb.query.law import DISTANCE, PLANE, ForceLaw
 from hapticdb.session.device_loop import empty_loop
 from hapticdb.session.report import spread_of

@@ -12,7 +12,9 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.law import TangentPlaneLaw
-from hapticdb.kernels.resident.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place
+from hapticdb.kernels.records.cells import MISSED
+from hapticdb.kernels.records.hand import RESULT
+from hapticdb.kernels.resident.cells import Cells, Place
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.resident.held import clusters_of
@@ -136,8 +138,8 @@ class Reader:
         self.clusters = clusters_of(shell, grid.voxel_size)
         self.row = table.join()
         self.hits = np.empty(len(shell), dtype=np.int64)
-        self.missed = np.zeros(64, dtype=np.int64)
-        self.out = np.zeros((1, RESULTS))
+        self.missed = np.zeros((), MISSED)
+        self.out = np.zeros(1, RESULT)
 
     def feel(self, pose: NDArray[np.float64]) -> tuple[list[int], bytes, int]:
         """Hits, wrench and number of unknown points."""
@@ -146,5 +148,5 @@ class Reader:
             TangentPlaneLaw(1000.0), self.hits, self.missed, self.out,
         )  # fmt: skip
         row = self.out[0]
-        wrench = row[WRENCH : WRENCH + 6] + 0.0  # turns -0.0 into 0.0
-        return self.hits[: int(row[HITS])].tolist(), wrench.tobytes(), int(row[UNKNOWNS])
+        wrench = row["wrench"] + 0.0  # turns -0.0 into 0.0
+        return self.hits[: int(row["hits"])].tolist(), wrench.tobytes(), int(row["unknown"])

@@ -16,7 +16,7 @@ from hapticdb.closing import Closes
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.kernels.law import reads_distances
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS, WRENCH
+from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.frame import HapticQuery, as_poses
@@ -235,10 +235,9 @@ class Feeler(Closes):
                 self._name(places, np.arange(len(places)), felt, ids)
         for chosen in self._pieces(order, progress):
             out = self._feel(places[chosen])
-            felt.forces[chosen] = out[:, WRENCH : WRENCH + 3]
-            felt.torques[chosen] = out[:, WRENCH + 3 : WRENCH + 6]
-            felt.hits[chosen], felt.n_contacts[chosen] = out[:, HITS], out[:, CONTACTS]
-            felt.deepest[chosen] = out[:, DEEPEST]
+            felt.forces[chosen], felt.torques[chosen] = np.hsplit(out["wrench"], 2)
+            felt.hits[chosen], felt.n_contacts[chosen] = out["hits"], out["contacts"]
+            felt.deepest[chosen] = out["deepest"]
             if objects:
                 self._name(places, chosen, felt, ids)
         if objects:
@@ -248,21 +247,21 @@ class Feeler(Closes):
             felt.named = Named(offsets, flat, self._query.known.by_id)
         return felt
 
-    def _feel(self, poses: Floats) -> Floats:
-        """Results (B, RESULTS) of frames at poses; poses with all cells resident come first."""
-        out = np.zeros((len(poses), RESULTS))
+    def _feel(self, poses: Floats) -> NDArray[np.void]:
+        """Results (B,) of RESULT of frames at poses; poses with all cells resident come first."""
+        out = np.zeros(len(poses), RESULT)
         self._run(poses, out)
-        pending = np.flatnonzero(out[:, UNKNOWNS] > 0.0)
+        pending = np.flatnonzero(out["unknown"] > 0.0)
         while len(pending):
             n_poses = self._frames.fetch(poses[pending])
             now, pending = pending[:n_poses], pending[n_poses:]
-            felt = np.zeros((n_poses, RESULTS))
+            felt = np.zeros(n_poses, RESULT)
             self._run(poses[now], felt)
             out[now] = felt
         return out
 
-    def _run(self, poses: Floats, out: Floats) -> None:
-        """Frames at poses into out (B, RESULTS), in all threads."""
+    def _run(self, poses: Floats, out: NDArray[np.void]) -> None:
+        """Frames at poses into out (B,) of RESULT, in all threads."""
         cells, place, law = self._frames.cells, self._residency.place, self._frames.law
 
         def work(memory: ThreadMemory, one: slice) -> None:

@@ -16,7 +16,7 @@ from hapticdb.errors import MissingExtraError, pip_line
 from hapticdb.kernels import rigid
 from hapticdb.kernels.gpu import frames as kernels
 from hapticdb.kernels.gpu import nearest as searches
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS
+from hapticdb.kernels.gpu.frames import RESULTS
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.mirror import CellMirror
 
@@ -119,9 +119,7 @@ class _Lane:
         n = self.part.stop - self.part.start
         rows = self.out[: n * RESULTS].reshape(RESULTS, n)
         vectors = self.out[: 6 * n].reshape(2, n, 3)
-        return RawFrames(
-            vectors[0], vectors[1], rows[HITS], rows[CONTACTS], rows[UNKNOWNS], rows[DEEPEST]
-        )
+        return RawFrames(vectors[0], vectors[1], *rows[6:])
 
 
 class GpuFrames:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.records import MOST_MISSED, NEAR_CUBE
+from hapticdb.kernels.records.cells import MISSED
+from hapticdb.kernels.records.rows import NEAR_CUBE
 from hapticdb.kernels.resident.cells import Clusters
 from hapticdb.kernels.resident.nearest import NOT_KNOWN
 from hapticdb.resident.frames import ResidentFrames
@@ -68,7 +69,7 @@ class BatchThreads:
                         self._rows[-1],
                         frames.clusters._replace(scratch=np.empty_like(frames.clusters.scratch)),
                         np.empty(len(frames.shell), dtype=np.int64),
-                        np.zeros(1 + MOST_MISSED, dtype=np.int64),
+                        np.zeros((), MISSED),
                         np.empty(CUBES, NEAR_CUBE),  # no memory before `forget` writes to it
                     )
                 )

@@ -9,13 +9,14 @@ from hapticdb.devices.protocol import Reading
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import follow
-from hapticdb.kernels.records import HANDLE, pose_numbers
+from hapticdb.kernels.records.hand import HANDLE
+from hapticdb.kernels.records.layout import pose_numbers
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import quaternion_of
 
 Floats = NDArray[np.float64]
 Hand = NDArray[np.void]
-"""A record () of `kernels.records.HAND`."""
+"""A record () of `kernels.records.hand.HAND`."""
 MOST_SCALE = 1e6
 """Greatest scale: a millimetre of the hand is a kilometre of the scene."""
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels.query import bricks as kernels
 from hapticdb.kernels.query import contact
-from hapticdb.kernels.records import BRICK, ENTRIES_A_ROW, MEASURED, OCCUPIED
+from hapticdb.kernels.records.rows import BRICK, ENTRIES_A_ROW, MEASURED, OCCUPIED
 from hapticdb.store.base import (
     BRICK_SHIFT,
     NO_DISTANCES,

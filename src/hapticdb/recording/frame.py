@@ -5,7 +5,7 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.records import FRAME
+from hapticdb.kernels.records.hand import FRAME
 
 __all__ = ["FRAME", "Frames", "State"]
 

@@ -18,7 +18,7 @@ import numpy as np
 from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.kernels._machine_code import build
-from hapticdb.kernels.records import FRAME
+from hapticdb.kernels.records.hand import FRAME
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane, law_named
 from hapticdb.store.filtering import Filter

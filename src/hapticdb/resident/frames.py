@@ -8,18 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.law import felt_within, reads_distances
-from hapticdb.kernels.records import MOST_MISSED
+from hapticdb.kernels.records.cells import MISSED
+from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident import cell_table as kernels
-from hapticdb.kernels.resident.cells import (
-    CONTACTS,
-    DEEPEST,
-    HITS,
-    RESULTS,
-    UNKNOWN,
-    UNKNOWNS,
-    WRENCH,
-    Clusters,
-)
+from hapticdb.kernels.resident.cells import UNKNOWN, Clusters
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.kernels.resident.first_hits import UNDECIDED, find_first_hits
 from hapticdb.pointshell.shell import PointShell
@@ -142,7 +134,7 @@ class ResidentFrames:
         self.clusters = clusters_of(shell, size, run)
         self.hits = np.empty(len(shell), dtype=np.int64)
         self.surroundings = _surroundings_of(self.clusters, size, felt_within(self.law))
-        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        self.missed = np.zeros((), MISSED)
         self._row = table.join()
 
     def close(self) -> None:
@@ -158,18 +150,18 @@ class ResidentFrames:
             If a pose is not rigid.
         """
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
-        out = np.zeros((len(matrices), RESULTS))
+        out = np.zeros(len(matrices), RESULT)
         done = 0
         while done < len(matrices):
             n_poses = self.fetch(matrices[done:])
             self._run(matrices, out, done, n_poses)
             done += n_poses
         return FeltFrames(
-            out[:, WRENCH : WRENCH + 6],
-            out[:, HITS].astype(np.int64),
-            out[:, CONTACTS].astype(np.int64),
-            out[:, UNKNOWNS].astype(np.int64),
-            out[:, DEEPEST],
+            out["wrench"],
+            out["hits"].astype(np.int64),
+            out["contacts"].astype(np.int64),
+            out["unknown"].astype(np.int64),
+            out["deepest"],
         )
 
     def collides(
@@ -221,7 +213,7 @@ class ResidentFrames:
         residency.make_resident(cells)
         return int(n_poses)
 
-    def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:
+    def _run(self, poses: Floats, out: NDArray[np.void], start: int, n_poses: int) -> None:
         """Compute the frames at poses start .. start + n_poses - 1, with resident cells."""
         part = slice(start, start + n_poses)
         done = feel_kernel(

@@ -10,8 +10,8 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.field.lattice import BEYOND
 from hapticdb.kernels.field.law import DistanceFieldLaw
 from hapticdb.kernels.law import reads_distances
+from hapticdb.kernels.records.cells import BUFFERS
 from hapticdb.kernels.resident.cells import (
-    BUFFERS,
     CELL_WORDS,
     EMPTY_SLOT,
     UNKNOWN,

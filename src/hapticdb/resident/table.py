@@ -20,7 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 from hapticdb.closing import Closes
 from hapticdb.errors import UsageError
 from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES
-from hapticdb.kernels.records import FIGURES, SESSION
+from hapticdb.kernels.records.cells import BUFFERS, CONTROL, FIGURES, READER, REQUEST
 from hapticdb.kernels.resident import cells as kernels
 
 DEFAULT_BUDGET = 256 << 20
@@ -32,21 +32,18 @@ FIRST_VERSION = 1
 MOST_READERS = 80
 """Greatest number of readers of a table at the same time: the 64 sessions of a host, and others.
 Larger: 2.5 KiB of the table for each, and an eviction checks more of them."""
-HEARTBEAT, LOST, STOP = 8, 9, 10
-"""Indices in the control block, after those of `kernels.cells`: time of the database's last answer
-(ns, CLOCK_MONOTONIC), whether it is lost, whether all processes must end."""
 _PAGE = 4096
 _joining = threading.Lock()
 
 
 class RequestQueue(NamedTuple):
-    """Messages between sessions and the prefetch process; `kernels.records` defines the fields.
+    """Messages between sessions and the prefetch process; `kernels.records.cells` has the fields.
 
-    sessions (R,) of SESSION, one row for each reader; pids (R,) int64: ids of the processes of
+    requests (R,) of REQUEST, one row for each reader; pids (R,) int64: ids of the processes of
     the rows, 0 for none; figures () of FIGURES: counts of the prefetch process.
     """
 
-    sessions: NDArray[np.void]
+    requests: NDArray[np.void]
     pids: NDArray[np.int64]
     figures: NDArray[np.void]
 
@@ -65,13 +62,13 @@ def _fields(n_slots: int, *, has_distances: bool) -> list[_Field]:
         _Field("near", np.uint32, (n_slots, kernels.CELL_WORDS)),
     ]
     return [
-        _Field("control", np.int64, (kernels.CONTROL_WORDS,)),
-        _Field("readers", np.int64, (rows * kernels.READER_STRIDE,)),
-        _Field("sessions", SESSION, (rows,)),
+        _Field("control", CONTROL, ()),
+        _Field("readers", READER, (rows,)),
+        _Field("requests", REQUEST, (rows,)),
         _Field("pids", np.int64, (rows,)),
         _Field("figures", FIGURES, ()),
-        _Field("keys", np.int64, (kernels.BUFFERS, capacity)),
-        _Field("slots", np.int32, (kernels.BUFFERS, capacity)),
+        _Field("keys", np.int64, (BUFFERS, capacity)),
+        _Field("slots", np.int32, (BUFFERS, capacity)),
         _Field("words", np.uint32, (n_slots, kernels.CELL_WORDS)),
         _Field("masks", np.uint64, (n_slots,)),
         _Field("used", np.uint8, (n_slots,)),
@@ -180,7 +177,7 @@ class CellTable(Closes):
         descriptor = anonymous_memory("hapticdb-cells", size)
         table = cls(descriptor, n_slots)
         table.cells.keys[:] = kernels.UNKNOWN
-        table.cells.control[kernels.VERSION] = FIRST_VERSION
+        table.cells.control["version"] = FIRST_VERSION
         if table.cells.payload is not None:
             table.cells.payload[kernels.EMPTY_SLOT] = BEYOND
         return table
@@ -203,12 +200,12 @@ class CellTable(Closes):
     @property
     def version(self) -> int:
         """Number of the published directory."""
-        return int(self.cells.control[kernels.VERSION])
+        return int(self.cells.control["version"])
 
     @property
     def revision(self) -> int:
         """Revision of the database for the published cells."""
-        return int(self.cells.control[kernels.REVISION + self.version % kernels.BUFFERS])
+        return int(self.cells.control["revisions"][self.version % BUFFERS])
 
     def join(self) -> int:
         """Become a reader; returns its row.
@@ -223,7 +220,7 @@ class CellTable(Closes):
             if len(free):
                 row = int(free[0])
                 self._clear(row)
-                sequence = self.queue.sessions["sequence"]
+                sequence = self.queue.requests["sequence"]
                 sequence[row] += sequence[row] % 2  # odd if the last session died while it wrote
                 self.queue.pids[row] = os.getpid()
                 return row
@@ -240,14 +237,14 @@ class CellTable(Closes):
         dead = [pid for pid in set(pids.tolist()) - {0} if not is_alive(pid)]  # one may own many
         if dead:
             for row in np.flatnonzero(np.isin(pids, dead)).tolist():
-                self.cells.readers[row * kernels.READER_STRIDE] = 0
-                self.queue.sessions["told"]["is_active"][row] = False
+                self.cells.readers["version"][row] = 0
+                self.queue.requests["prefetch"]["is_active"][row] = False
 
     def _clear(self, row: int) -> None:
-        self.cells.readers[row * kernels.READER_STRIDE] = 0
-        for name in SESSION.names or ():
+        self.cells.readers["version"][row] = 0
+        for name in REQUEST.names or ():
             if name != "sequence":
-                self.queue.sessions[name][row] = 0
+                self.queue.requests[name][row] = 0
 
     @contextmanager
     def reading(self) -> Iterator[int]:

@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hapticdb.kernels.records.cells import BUFFERS
 from hapticdb.kernels.resident import cell_table as kernels
-from hapticdb.kernels.resident.cells import BUFFERS, EMPTY_SLOT, UNKNOWN
+from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import NO_KEYS, Keys
 

@@ -30,9 +30,9 @@ from hapticdb.kernels._jit import ENTRIES
 from hapticdb.kernels.hand.calling import FUNCTION, address_of
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.period.loop import DEVICE, NOBODY
-from hapticdb.kernels.records import pose_numbers, views_of
+from hapticdb.kernels.records.layout import pose_numbers, views_of
 from hapticdb.query.law import ForceLaw
-from hapticdb.resident.table import LOST, STOP, CellTable
+from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import Rendering
 from hapticdb.session.processes.process import LOOK_EVERY, MessageSender, parent_is_gone
 from hapticdb.session.report import LoopAnswer, LoopFigures
@@ -75,9 +75,10 @@ class DeviceLoop:
         self.reader = Reader(request.device)
         self.slot = clock.slots[request.slot_request.slot, ...]
         self.state = clock.add(request.slot_request, request.table)
-        self.session = self.state.session
-        self.state.row["source"], self.state.row["is_running"] = DEVICE, True
-        self.state.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
+        self.queued = self.state.request
+        clock.enter(self.state)
+        self.slot["source"] = DEVICE
+        self.slot["staleness"] = round(min(request.staleness, 1e9) * 1e9)
         self.gpu: GpuQueries | None = None
         if request.is_on_gpu:
             from hapticdb.session import gpu_queries  # noqa: PLC0415 - loads numba.cuda
@@ -86,8 +87,7 @@ class DeviceLoop:
             self.state.follower["merges_from"] = gpu_queries.MERGES_FROM
         self.tool, self.hand = self.state.servo["tool"], self.state.servo["hand"]
         self.sent = views_of(self.state.servo["sent"])
-        self._reading = views_of(self.state.record["reading"])
-        self._is_asked_to_end = self.slot["is_asked_to_end"]
+        self._reading = views_of(self.slot["reading"])
         self.bad_reading: str | None = None
         self.is_warm = False
         self._error: BaseException | None = None
@@ -101,11 +101,11 @@ class DeviceLoop:
         Without a database it does not wait: the supervisor reports that at once.
         """
         started = time.monotonic()
-        session, asked = self.session, 0
+        session, asked = self.queued, 0
         control = self.table.cells.control
         self._place()
         while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
-            if control[LOST]:
+            if control["is_lost"]:
                 break
             if asked and session["heard"] >= asked:
                 if session["n_missing"] == 0:
@@ -126,7 +126,7 @@ class DeviceLoop:
         reading, handle = self._read(), self.request.handle
         self._take(reading)
         handle.start(reading, self.hand)
-        self.state.record["handle"] = handle.record
+        self.slot["handle"] = handle.record
         # a held first frame must not report hits at an earlier place
         self.state.rest_at(pose_numbers(self.hand).copy())
 
@@ -151,7 +151,7 @@ class DeviceLoop:
         self._place()
         for _ in range(3):
             self._step(1e-3)
-        self.session["told"]["is_active"] = False
+        self.queued["prefetch"]["is_active"] = False
         self.device.apply(np.zeros(6))
 
     # -- one frame ---------------------------------------------------------------------------
@@ -167,20 +167,18 @@ class DeviceLoop:
         if self.gpu is not None:
             self.gpu.check()
 
-    def _is_stopped(self) -> bool:
-        return bool(self.table.cells.control[STOP]) or bool(self._is_asked_to_end)
-
     def _is_left(self) -> bool:
-        return self._is_stopped() or parent_is_gone()
+        is_over = self.table.cells.control["is_over"] or self.slot["is_asked_to_end"]
+        return bool(is_over) or parent_is_gone()
 
     # -- the loop ----------------------------------------------------------------------------
 
     def run(self) -> LoopFigures:
         """Run frames until the time is over, the device's script ends, or a stop is requested."""
-        row = self.state.row
+        slot = self.slot
         called = self._called(self._read_hand), self._called(self._pusher())
-        row["reads"], row["pushes"] = map(address_of, called)
-        row["is_frame"] = True
+        slot["reads"], slot["pushes"] = map(address_of, called)
+        slot["is_frame"] = True
         before = signal.signal(signal.SIGTERM, self._end)
         try:
             seconds = self.clock.run(self.timing.rate, self.request.seconds)
@@ -231,7 +229,7 @@ class DeviceLoop:
             device.apply(applied)
             if math.isnan(x.item()) and self.bad_reading is None:
                 self.bad_reading = self.reader.complaint() or None
-            if self._is_stopped() or (ends is not None and ends.is_over):
+            if ends is not None and ends.is_over:
                 return True
             return n_frames.item() % look_every == 0 and parent_is_gone()
 
@@ -253,7 +251,7 @@ def empty_loop(
     It ends at once if the parent ends, or closes its channel.
     """
     clock = PeriodClock(law, rendering=rendering)
-    clock.rows["source"], clock.rows["is_running"] = NOBODY, True
+    clock.slots["source"], clock.slots["worker"] = NOBODY, clock.worker
 
     # sleeps meanwhile: the kernel holds no interpreter lock, and nothing else can end it
     def end() -> None:

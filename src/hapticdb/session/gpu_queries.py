@@ -22,8 +22,10 @@ from hapticdb.kernels.hand.near_points import (
     POINTS_ANEW,
     SHUT,
 )
-from hapticdb.kernels.records import LOOK, MOST_MISSED, views_of
-from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place
+from hapticdb.kernels.records.cells import MOST_MISSED
+from hapticdb.kernels.records.hand import QUERY
+from hapticdb.kernels.records.layout import views_of
+from hapticdb.kernels.resident.cells import Place
 from hapticdb.query.law import DISTANCE
 from hapticdb.resident.mirror import CellMirror
 from hapticdb.resident.table import CellTable
@@ -111,20 +113,20 @@ class GpuQueries:
         self._state, self._table = state, table
         self._follower = views_of(state.follower)
         self._tried = state.servo["tool"]["tried_pose"]
-        self._place = Place(*state.record["place"].tolist())
+        self._place = Place(*state.slot["place"].tolist())
         self._mirror = CellMirror(table, DISTANCE.for_kernels, side=None)
         self._n_looks, self._epoch = 0, 0
         self._error: BaseException | None = None
         self._stream = cuda.stream()
         self._nothing = cuda.to_device(NOTHING)
         self._found: NDArray[np.float64] = cuda.pinned_array(kernels.FOUND, np.float64)
-        self._asked: NDArray[np.void] = cuda.pinned_array(1, LOOK)
+        self._asked: NDArray[np.void] = cuda.pinned_array(1, QUERY)
         self._view = self._view_of(state)
         n_runs = self._view.run_due.size
         self._of_runs = min(-(-n_runs // kernels.THREADS_OF_RUNS), kernels.MOST_BLOCKS)
         self._of_points = min(n_runs, kernels.MOST_BLOCKS)
         self._kernel = kernels.look_at_runs(kernels.THREADS)
-        self._asked[:] = np.zeros((), LOOK)
+        self._asked[:] = np.zeros((), QUERY)
         self._asked["number"], self._asked["run"] = -1, 1
         self._launch_look()  # compiles them; no run is due yet
         self._launch_put_back()
@@ -151,7 +153,7 @@ class GpuQueries:
             epochs=cuda.to_device(np.full(n_runs, -1)),
             seen=cuda.to_device(np.zeros(n_runs, np.int64)),
             due_runs=cuda.device_array(n_runs, np.int64),
-            asked=cuda.device_array(1, LOOK),
+            asked=cuda.device_array(1, QUERY),
             used=cuda.to_device(np.zeros(table.n_slots, np.uint8)),
             missed=cuda.to_device(np.full(kernels.ROOM_FOR_MISSED, -1)),
             found=cuda.to_device(NOTHING),
@@ -177,7 +179,7 @@ class GpuQueries:
     def _looked(self) -> int:
         """Near points at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
         follower, state = self._follower, self._state
-        self._mirror.update(int(state.cells.readers[state.reader * READER_STRIDE]))
+        self._mirror.update(int(state.cells.readers["version"][state.reader]))
         self._mirror.seen()  # in the arrays that the launches read
         if self._n_looks % USED_EVERY == 0:
             self._tell_used()
@@ -277,13 +279,12 @@ class GpuQueries:
     def _tell_missed(self, n_unknown: int) -> None:
         """List the query's unknown cells, for the prefetch process."""
         missed, keys = self._state.missed, self._view.missed
-        missed[LISTED] = 0
+        missed["n_cells"] = 0
         if n_unknown:
             found = keys.copy_to_host()
             keys.copy_to_device(np.full(kernels.ROOM_FOR_MISSED, -1))
             found = np.sort(found[found >= 0])[:MOST_MISSED]
-            missed[LISTED] = len(found)
-            missed[LISTED + 1 : LISTED + 1 + len(found)] = found
+            missed["n_cells"], missed["cells"][: len(found)] = len(found), found
 
     def _tell_used(self) -> None:
         """Mark the read cells in the table, so others are evicted."""

@@ -1,12 +1,10 @@
 """SessionHost: many hands in few worker processes, over shared tables of cells."""
 
 import itertools
-import logging
 import os
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from typing import Any
 
@@ -30,17 +28,14 @@ from hapticdb.session.prefetch.resident_cells import ResidentCells, without_dist
 from hapticdb.session.prefetch.tables import SharedTables
 from hapticdb.session.running import Running
 from hapticdb.session.shared_table import SharedTable
+from hapticdb.session.supervisor import Supervisor
 from hapticdb.session.timing import Timing
 from hapticdb.session.workers import Workers
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 
-LOG = logging.getLogger("hapticdb.session")
 MOST_SESSIONS = 64
 """Most sessions of a host. Larger: more shared memory, 960 kB each."""
-TEND_EVERY = 0.05
-"""Seconds between two checks of recordings and processes. Larger: less work, and a death is noticed
-later. A recording loses frames from 2 s on."""
 
 
 class SessionHost(Closes):
@@ -75,21 +70,17 @@ class SessionHost(Closes):
         self._tables = SharedTables(url, budget_bytes)
         self._shared = SharedTable.create(MOST_SESSIONS)
         self._workers = Workers(self._shared, rate, processes or os.cpu_count() or 1)
-        self._running: dict[int, Running] = {}
+        self._supervisor = Supervisor(self._shared, self._tables.all)
         self._ids = itertools.count(1)
         self._changing = threading.RLock()
         self._served: list[socket.socket] = []
-        self._is_closed = threading.Event()
-        self.failure: HapticDBError | None = None
-        """Lasting error of a prefetch process; None without one."""
+        self._is_closed = False
         self._pid = os.getpid()
-        self._logged: set[str] = set()
-        self._tending = [
-            threading.Thread(target=self._tend, args=(look,), daemon=True, name="host")
-            for look in (self._look_after_sessions, self._look_after_cells)
-        ]
-        for thread in self._tending:
-            thread.start()
+
+    @property
+    def failure(self) -> HapticDBError | None:
+        """Lasting error of a prefetch process; None without one."""
+        return self._supervisor.failure
 
     def begin(
         self,
@@ -119,7 +110,7 @@ class SessionHost(Closes):
         Handle(scale=scale)  # checks it
         felt = Filter(where, exclude)
         with self._changing:
-            if self._is_closed.is_set():
+            if self._is_closed:
                 raise UsageError("the host is closed: make another")
             return self._begin(shell, pose, felt, coupling, scale)
 
@@ -144,7 +135,7 @@ class SessionHost(Closes):
                 rendering, SCRIPTED, self.rate, scale, radius_of(shell, cells.grid.voxel_size)
             )
             worker = self._workers.least_busy(law, rendering)
-            running = Running(number, self._shared, cells, shell, settled, worker.number)
+            running = Running(number, self._shared, cells, shell, settled)
             undo.callback(running.close)
             running.worker = worker
             hand = np.array(row_of_pose(pose))
@@ -155,19 +146,19 @@ class SessionHost(Closes):
                 "begin", running.request, hand, id(cells), table.n_slots,
                 descriptors=[table.descriptor],
             )  # fmt: skip
-            self._running[number] = running
+            self._supervisor.sessions[number] = running
             undo.pop_all()
         return HostedSession(self._shared, running.slot, number, self._call)
 
     def sessions(self) -> list[HostedSession]:
         """Sessions now, by their ids."""
-        running = sorted(self._running.items())
+        running = sorted(self._supervisor.sessions.items())
         return [HostedSession(self._shared, r.slot, number, self._call) for number, r in running]
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
         """Do a session's request; see `HostedSession`."""
         with self._changing:
-            running = self._running.get(session)
+            running = self._supervisor.sessions.get(session)
             if running is None:
                 if word == "end":
                     return None
@@ -177,16 +168,11 @@ class SessionHost(Closes):
 
     def _end(self, running: Running) -> Recorded:
         """End a session, working or not; returns the size of its recording."""
-        self._running.pop(running.session, None)
-        with ExitStack() as ends:  # the last one runs first, and each runs even if another fails
-            ends.callback(self._tables.release, running.cells)
-            ends.callback(running.close)
-            try:
-                if running.worker.is_alive:
-                    running.worker.ask("end", running.slot)
-            finally:
-                recorded = running.stop_recording()
-        return recorded
+        self._supervisor.sessions.pop(running.session, None)
+        try:
+            return running.end()
+        finally:
+            self._tables.release(running.cells)
 
     def serve(self, sock: socket.socket) -> None:
         """Serve an `AttachedHost` in a thread; the host owns the socket from now on."""
@@ -197,40 +183,6 @@ class SessionHost(Closes):
             daemon=True,
             name="attached",
         ).start()
-
-    def _tend(self, look: Callable[[], None]) -> None:
-        """Repeat a check, without `_changing`: a slow begin has that lock."""
-        while not self._is_closed.wait(TEND_EVERY):
-            look()
-
-    def _look_after_sessions(self) -> None:
-        """Record frames, notice dead workers."""
-        for running in list(self._running.values()):
-            with self._surviving("recording a session"):
-                if running.worker.is_alive:
-                    running.take_frames()
-                else:
-                    self._shared.lose(running.slot, running.session)
-
-    def _look_after_cells(self) -> None:
-        """Start ended prefetch processes again."""
-        for cells in self._tables.all():
-            with self._surviving("starting a prefetch process again"):
-                try:
-                    cells.supervise()
-                except HapticDBError as error:
-                    self.failure = error
-
-    @contextmanager
-    def _surviving(self, work: str) -> Iterator[None]:
-        """Go on after an error; its first occurrence is logged."""
-        try:
-            yield
-        except Exception as error:
-            said = f"{work}: {type(error).__name__}: {error}"
-            if said not in self._logged:
-                self._logged.add(said)
-                LOG.exception("%s failed; later errors of this kind are not logged", work)
 
     @property
     def cells(self) -> list[ResidentCells]:
@@ -244,20 +196,15 @@ class SessionHost(Closes):
 
     def close(self) -> None:
         """End all sessions, processes and recordings; a second call does nothing."""
-        if os.getpid() != self._pid or self._is_closed.is_set():
+        if os.getpid() != self._pid or self._is_closed:
             return
-        self._is_closed.set()
-        for thread in self._tending:
-            with suppress(RuntimeError):
-                thread.join()
+        self._is_closed = True
         with self._changing, ExitStack() as ends:
-            ends.callback(self._shared.close)
             ends.callback(self._tables.close)
             ends.callback(self._workers.close)
             for sock in self._served:
                 ends.callback(_shut, sock)
-            for running in list(self._running.values()):
-                ends.callback(self._end, running)
+            ends.callback(self._supervisor.close)
 
 
 def _shut(sock: socket.socket) -> None:

@@ -75,7 +75,7 @@ class HostedSession:
         self._shared.put_hand(self._open_slot(), time.monotonic_ns(), row)
 
     def latest(self) -> Frames | None:
-        """Latest frame, (1,) of `kernels.records.FRAME`; None before the first."""
+        """Latest frame, (1,) of `kernels.records.hand.FRAME`; None before the first."""
         return self._shared.last_frame(self._open_slot())
 
     def touched(self) -> tuple[int, ...]:

@@ -10,8 +10,8 @@ from hapticdb.environment import Environment
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.kernels._machine_code import build
 from hapticdb.kernels.hand.near_points import FAR, LONGEST_REST
-from hapticdb.kernels.records import FRAME, SEAT, pose_numbers, views_of
-from hapticdb.kernels.resident.cells import LISTED, VERSION
+from hapticdb.kernels.records.hand import FRAME
+from hapticdb.kernels.records.layout import pose_numbers, views_of
 from hapticdb.poses import poses_of
 from hapticdb.query.law import reads_distances
 from hapticdb.recording.file import Recording
@@ -125,13 +125,12 @@ class _Again:
 
     def __init__(self, recording: Recording, residency: Residency, table: CellTable) -> None:
         header, self._residency, self._table = recording.header, residency, table
-        self._slots = np.zeros(1, SEAT)
         self._ring = np.zeros((1, BLOCK), FRAME)
-        self._clock = PeriodClock(header.law, self._slots, self._ring, header.rendering)
+        self._clock = PeriodClock(header.law, rings=self._ring, rendering=header.rendering)
         row = table.join()
         self._state = state = SessionState(
-            self._clock.rows, table.cells, row, table.queue.sessions[row, ...], header.grid,
-            clusters_of(header.shell, header.grid.voxel_size),
+            self._clock.slots[0, ...], table.cells, row, table.queue.requests[row, ...],
+            header.grid, clusters_of(header.shell, header.grid.voxel_size),
         )  # fmt: skip
         try:
             state.restore(header.start)
@@ -139,9 +138,10 @@ class _Again:
             raise UsageError(
                 f"{recording.path}: its state is of another build, {header.build}: record it again"
             ) from None
-        self._row = views_of(state.record)
+        self._slot = views_of(state.slot)
         self._hand = pose_numbers(state.servo["hand"])
-        self._row.is_frame[()] = self._row.is_running[()] = 1
+        self._slot.is_frame[()] = 1
+        self._clock.enter(state)
         self._center = np.append(header.shell.center, 1.0)
         self._radius = radius_of(header.shell, header.grid.voxel_size)
 
@@ -173,26 +173,27 @@ class _Again:
 
     def _run(self, frames: Frames) -> NDArray[np.int64]:
         """Run frames into the ring -> their cells (n,) missing in memory."""
-        row, servo, hand = self._row, self._row.servo, self._row.servo.hand
+        slot, servo, hand = self._slot, self._slot.servo, self._slot.servo.hand
         version, missed = servo.tool.version, [np.empty(0, np.int64)]
         state = frames["state"].astype(np.int64)
         is_open, is_stale, is_anew = (
             (state & bit != 0).tolist() for bit in (State.CLUTCH_OPEN, State.STALE, State.ANEW)
         )
         dt, unknown = frames["dt"].tolist(), self._ring[0]["unknown"]
-        self._slots["n_frames"] = 0
+        published = self._table.cells.control["version"]
+        slot.n_frames[()] = 0
         for n, frame in enumerate(frames):
             self._hand[:], hand.velocity[:] = frame["hand"], frame["hand_velocity"]
             hand.is_open[()] = is_open[n]
-            row.staleness[()] = -NEVER_NS if is_stale[n] else NEVER_NS
-            row.springs[0] = frame["spring"]
-            row.reading.buttons[()] = frame["buttons"]
+            slot.staleness[()] = -NEVER_NS if is_stale[n] else NEVER_NS
+            slot.springs[0] = frame["spring"]
+            slot.reading.buttons[()] = frame["buttons"]
             if version:  # the cells seem to have changed where they did in the session
-                version[()] = -1 if is_anew[n] else self._table.cells.control[VERSION]
+                version[()] = -1 if is_anew[n] else published.item()
             self._clock.step(dt[n], 0)
             if unknown[n]:
-                listed = self._state.missed[LISTED]
-                missed.append(self._state.missed[LISTED + 1 :][:listed])
+                unknowns = self._state.missed
+                missed.append(unknowns["cells"][: unknowns["n_cells"]].copy())
         return np.unique(np.concatenate(missed))
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.records import TIME_BIN, TIME_BINS
+from hapticdb.kernels.records.session import TIME_BIN, TIME_BINS
 from hapticdb.session.coupling import DirectRendering
 from hapticdb.session.prefetch.resident_cells import CacheFigures
 
@@ -63,11 +63,11 @@ class LoopFigures:
 
     @classmethod
     def of_slot(cls, slot: NDArray[np.void], seconds: float) -> Self:
-        """Timing of a session; slot : its row of `SEAT`; seconds : its duration."""
+        """Timing of a session; slot : its row of `SLOT`; seconds : its duration."""
         spreads = [
             spread_of(slot[name], float(slot[f"worst_{name}"])) for name in ("lateness", "elapsed")
         ]
-        return cls(int(slot["n_frames"]), seconds, int(slot["missed"]), *spreads)
+        return cls(int(slot["n_frames"]), seconds, int(slot["missed_deadlines"]), *spreads)
 
 
 class LoopAnswer(NamedTuple):
@@ -182,7 +182,7 @@ class Report:
 
 
 def counts_of(slot: NDArray[np.void]) -> dict[str, Any]:
-    """Counts of a session's slot, a row of `SEAT`, by their names in a `Report`."""
+    """Counts of a session's slot, a row of `SLOT`, by their names in a `Report`."""
     told = {one.name for one in fields(Report)}
     names = [n for n in slot.dtype.names or () if n in told and not slot.dtype[n].shape]
     counts = {name: slot[name].item() for name in names}

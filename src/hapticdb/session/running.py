@@ -1,12 +1,13 @@
 """Running: one session in its parent process, with a device or hosted."""
 
 import threading
+import time
 from contextlib import ExitStack
 from dataclasses import replace
 
 from hapticdb.closing import Closes
 from hapticdb.devices.profiles import SCRIPTED
-from hapticdb.errors import UsageError
+from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.recording.file import Recorder
 from hapticdb.recording.header import Start
@@ -17,11 +18,14 @@ from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.states import SlotRequest
 from hapticdb.session.workers import WorkerProcess
 
+END_PATIENCE = 5.0
+"""Seconds until the loop must have left an ending session; normally one period."""
+
 
 class Running(Closes):
     """A running session: its slot and reader row, until `close`; its worker; its recording.
 
-    session : its number; worker : number of its worker.
+    session : its number.
     """
 
     def __init__(
@@ -31,7 +35,6 @@ class Running(Closes):
         cells: ResidentCells,
         shell: PointShell,
         coupling: DirectRendering,
-        worker: int = 0,
     ) -> None:
         self.session, self.shared, self.cells = session, shared, cells
         self._worker: WorkerProcess | None = None
@@ -40,7 +43,7 @@ class Running(Closes):
         with ExitStack() as undo:
             reader = cells.table.join()
             undo.callback(cells.table.leave, reader)
-            self.slot = shared.take(session, worker)
+            self.slot = shared.take(session)
             undo.callback(shared.release, self.slot)
             self.request = SlotRequest(
                 self.slot, reader, cells.grid, replace(shell, surface=None), coupling
@@ -119,11 +122,23 @@ class Running(Closes):
                 recording.finish()
         return Recorded(0, 0) if recording is None else Recorded(len(recording), recording.n_lost)
 
-    def end_worker(self) -> None:
-        """End the worker of a session with a device, if it was started."""
-        if self._worker is not None:
-            self.shared.slots["is_asked_to_end"][self.slot] = True
-            self._worker.end()
+    def ask_to_end(self) -> None:
+        """Make the loop leave the session after its next frame: the one way in which one ends."""
+        self.shared.slots["is_asked_to_end"][self.slot] = True
+
+    def end(self) -> Recorded:
+        """End the session and its recording, and give slot and reader row back."""
+        self.ask_to_end()
+        worker, until = self.shared.slots["worker"], time.monotonic() + END_PATIENCE
+        with self:
+            try:
+                while worker[self.slot] and self._worker is not None and self._worker.is_alive:
+                    if time.monotonic() > until:
+                        raise HapticDBError("a worker's loop hangs: end the host")
+                    time.sleep(1e-3)
+            finally:
+                recorded = self.stop_recording()
+        return recorded
 
     def close(self) -> None:
         """Give slot and reader row back."""

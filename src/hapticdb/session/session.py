@@ -3,7 +3,7 @@
 import os
 import time
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,18 +16,14 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE, ForceLaw, LawName, as_law, reads_distances
 from hapticdb.recording.file import DEFAULT_LIMIT, Recorder
 from hapticdb.recording.frame import Frames, State
-from hapticdb.session.coupling import (
-    Coupling,
-    Rendering,
-    radius_of,
-    rendering_of,
-)
+from hapticdb.session.coupling import Coupling, Rendering, radius_of, rendering_of
 from hapticdb.session.device_loop import DeviceRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
 from hapticdb.session.report import LoopAnswer, Report, counts_of
 from hapticdb.session.running import Running
 from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.states import FOREVER
+from hapticdb.session.supervisor import LOOK_EVERY, Supervisor
 from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest
 from hapticdb.session.workers import WorkerProcess
@@ -40,10 +36,8 @@ RING_SECONDS = 4.0
 no frame, at more memory."""
 LEAST_RING = 1024
 """Least number of frames in the ring, however low the rate."""
-DRAIN_EVERY = 0.05
-"""Seconds between two checks of the loop in `wait`. A larger value reports its end later."""
 END_PATIENCE = 10.0
-"""Seconds from a request until the loop must have ended; normally one frame."""
+"""Seconds from a request until the report must have come; normally one frame."""
 DEFAULT_STALENESS = 1.0
 """Default of `staleness`, seconds without an answer of the database."""
 
@@ -152,11 +146,9 @@ class Session(Closes):
             radius_of(shell, cells.grid.voxel_size),
         )  # fmt: skip
         self._pid = os.getpid()
-        self._running: Running | None = None
-        self._objects: set[int] = set()
-        self._loose_objects: set[int] = set()
-        self._n_drained, self._has_touched = 0, False  # touched since it last lay in something
-        self._answer: LoopAnswer | None = None
+        self._supervisor: Supervisor | None = None
+        self._running: _DeviceSession | None = None
+        self._report: Report | None = None
         self._recording: Recorder | None = None
         if record is not None:
             self._recording = Recorder(
@@ -187,11 +179,9 @@ class Session(Closes):
         if self._recording is not None:
             self._recording.open()
         shared = SharedTable.create(1, max(int(RING_SECONDS * self.timing.rate), LEAST_RING))
-        try:
-            self._running = running = Running(1, shared, self.cells, self.shell, self.coupling)
-        except BaseException:
-            shared.close()
-            raise
+        cells = self.cells
+        self._supervisor = Supervisor(shared, lambda: [cells])  # not `self`: it is dropped
+        self._running = running = _DeviceSession(1, shared, cells, self.shell, self.coupling)
         alone = DeviceRequest(
             slot_request=running.request,
             table=self.cells.table,
@@ -203,9 +193,10 @@ class Session(Closes):
             is_on_gpu=self.frames_on == "cuda",
         )
         request = WorkerRequest(shared, self.timing, self.law, self.rendering, alone)
-        worker = running.worker = WorkerProcess(0, request)
+        worker = running.worker = WorkerProcess(request)
         if self._recording is not None:
             running.begin_recording(self._recording, 0, worker.ready, self.frames_on)
+        self._supervisor.sessions[1] = running
 
     def __del__(self) -> None:
         with suppress(Exception):
@@ -222,15 +213,15 @@ class Session(Closes):
         return self._open.worker.pid
 
     @property
-    def _open(self) -> Running:
-        if self._running is None:
+    def _open(self) -> "_DeviceSession":
+        if self._running is None or self._running.shared.descriptor < 0:
             raise UsageError("the session is closed: begin another")
         return self._running
 
     @property
     def objects(self) -> tuple[int, ...]:
         """Ids of the objects touched so far; sampled a hundred times a second."""
-        return tuple(sorted(self._objects))
+        return tuple(sorted(self._running.objects if self._running else ()))
 
     @property
     def is_loose(self) -> bool:
@@ -241,7 +232,7 @@ class Session(Closes):
     @property
     def loose_objects(self) -> tuple[int, ...]:
         """Ids of objects around the tool so far; sampled a hundred times a second."""
-        return tuple(sorted(self._loose_objects))
+        return tuple(sorted(self._running.loose_objects if self._running else ()))
 
     @property
     def recording_ended(self) -> str | None:
@@ -250,7 +241,7 @@ class Session(Closes):
 
     @property
     def database_lost(self) -> str | None:
-        """One line: why the database cannot be read now; None while it can. As of `wait`."""
+        """One line: why the database cannot be read now; None while it can."""
         return self.cells.database_lost
 
     def last(self) -> Frames | None:
@@ -258,30 +249,28 @@ class Session(Closes):
         return self._open.shared.last_frame(0)
 
     def wait(self, seconds: float | None = None) -> Report | None:
-        """Supervise the session until it ends; returns its report, or None after `seconds`.
-
-        Call this again and again, or without a time: only during the call frames are recorded, and
-        a dead prefetch process is started again.
-        """
-        running = self._open
+        """Wait for the session's end; returns its report, or None after `seconds`."""
+        running, until = self._open, time.monotonic() + (FOREVER if seconds is None else seconds)
         process = running.worker
-        until = time.monotonic() + (FOREVER if seconds is None else seconds)
-        while self._answer is None and time.monotonic() < until:
+        while self._report is None:
+            if self._supervisor is not None and self._supervisor.failure is not None:
+                raise self._supervisor.failure
             is_alive = process.is_alive  # read first: the last message may come with the end
-            message = process.receive(min(DRAIN_EVERY, max(until - time.monotonic(), 0.0)))
-            self._drain(running)
+            left = until - time.monotonic()
+            message = process.receive(min(LOOK_EVERY, max(left, 0.0)))
             if message is not None:
-                self._answer = message.content
+                self._report = self._reported(message.content)
             elif not is_alive:
                 raise HapticDBError(
                     "the worker process was ended from outside: begin the session again"
                 )
-            self.cells.supervise()
-        return self._report() if self._answer is not None else None
+            elif left <= 0.0:
+                return None
+        return self._report
 
     def ask_to_end(self) -> None:
         """Make the loop end after its next frame. `wait` then returns the report."""
-        self._open.shared.slots["is_asked_to_end"][0] = True
+        self._open.ask_to_end()
 
     def stop(self) -> Report:
         """End the session; returns its report."""
@@ -295,32 +284,8 @@ class Session(Closes):
             )
         return report
 
-    def _drain(self, running: Running) -> None:
-        """Add the touched objects to the list, and record the new frames."""
-        done = running.n_frames
-        asked = self.cells.table.queue.sessions[running.request.reader]
-        ring = running.shared.rings[0]
-        named = set(asked["objects"][: int(asked["n_objects"])].tolist())
-        first = max(self._n_drained, done - len(ring))
-        frames = ring[np.arange(first, done) % len(ring)]
-        self._n_drained = done
-        last = running.shared.last_frame(running.slot)
-        if last is not None and last["state"][0] & State.IN_OBJECT:
-            self._loose_objects |= named
-            self._has_touched = False
-        else:
-            touched = bool((frames["hits"] | frames["contacts"]).any())
-            self._has_touched = self._has_touched or touched
-            # before the first contact an answer about the place where the tool lay may be left
-            self._objects |= named if self._has_touched else named - self._loose_objects
-        running.take_frames()
-
-    def _report(self) -> Report:
-        answer = self._answer
-        assert answer is not None  # noqa: S101 - asked before
-        recording = self._recording
-        if recording is not None:
-            recording.finish()
+    def _reported(self, answer: LoopAnswer) -> Report:
+        recorded = self._open.stop_recording()
         return Report(
             rate=self.timing.rate,
             loop=answer.loop,
@@ -331,10 +296,10 @@ class Session(Closes):
             cache=self.cells.figures(),
             objects=self.objects,
             loose_objects=self.loose_objects,
-            recorded_frames=0 if recording is None else len(recording),
+            recorded_frames=recorded.frames,
             recording_ended=self.recording_ended,
             database_lost=self.database_lost,
-            lost_records=0 if recording is None else recording.n_lost,
+            lost_records=recorded.lost,
             law="distance" if reads_distances(self.law) else "plane",
             rendering=self.rendering,
             coupling=self.coupling,
@@ -361,12 +326,48 @@ class Session(Closes):
                 ends.callback(self.cells.close)
             if self._recording is not None:
                 ends.callback(self._recording.close)
-            running, self._running = self._running, None
-            if running is not None:
-                ends.callback(running.shared.close)
-                ends.callback(running.close)
-                ends.callback(self._drain, running)
-                ends.callback(running.end_worker)
+            if self._supervisor is not None:
+                ends.callback(self._supervisor.close)
+            if self._running is not None:
+                ends.callback(self._running.end)
+                ends.callback(self._running.end_process)
+
+
+class _DeviceSession(Running):
+    """A running session with a device, and the ids of objects met so far."""
+
+    def __init__(self, *given: Any) -> None:  # noqa: ANN401 - as of `Running`
+        super().__init__(*given)
+        self.objects: set[int] = set()
+        self.loose_objects: set[int] = set()
+        self._n_seen, self._has_touched = 0, False  # touched since it last lay in something
+
+    def take_frames(self) -> None:
+        """Add the touched objects to the lists, and record the new frames."""
+        with self._taking:
+            self._list_objects()
+        super().take_frames()
+
+    def _list_objects(self) -> None:
+        done, ring = self.n_frames, self.shared.rings[self.slot]
+        asked = self.cells.table.queue.requests[self.request.reader]
+        named = set(asked["objects"][: int(asked["n_objects"])].tolist())
+        frames = ring[np.arange(max(self._n_seen, done - len(ring)), done) % len(ring)]
+        self._n_seen = done
+        last = self.shared.last_frame(self.slot)
+        if last is not None and last["state"][0] & State.IN_OBJECT:
+            self.loose_objects |= named
+            self._has_touched = False
+            return
+        self._has_touched |= bool((frames["hits"] | frames["contacts"]).any())
+        # before the first contact an answer about the place where the tool lay may be left
+        self.objects |= named if self._has_touched else named - self.loose_objects
+
+    def end_process(self) -> None:
+        """End the loop and its process, which sets the device's force to zero."""
+        self.ask_to_end()
+        if self._worker is not None:
+            self._worker.end()
 
 
 def _check_choices(seconds: float | None, staleness: float) -> None:

@@ -1,7 +1,7 @@
 """SharedTable: a slot for each session, in shared memory.
 
-A slot is a row of `SEAT`: frames and counts of a session, and a hosted hand. A page
-or its like writes the hand's pose, the session's worker the results. No reader waits for a writer:
+A slot is a row of `SLOT`: the state of a session. The client of a hosted hand writes its pose, the
+session's worker the results. No reader waits for a writer:
 an odd sequence number marks an unfinished write, and the reader reads again.
 """
 
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from hapticdb.closing import Closes
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.kernels.records import FRAME, MOST_SHOWN, SEAT
+from hapticdb.kernels.records.hand import FRAME
+from hapticdb.kernels.records.session import MOST_SHOWN, SLOT
 from hapticdb.recording.frame import Frames
 from hapticdb.resident.table import anonymous_memory
 
@@ -37,14 +38,14 @@ FREE, TAKEN, LOST = 0, 1, 2
 """States of a slot: free, in use, in use by a session with a dead worker."""
 
 Slots = NDArray[np.void]
-"""Rows of `kernels.records.SEAT`."""
+"""Rows of `kernels.records.session.SLOT`."""
 
 
 class SharedTable(Closes):
     """Slots of sessions in shared memory.
 
     descriptor : of the memory from `create`; owned from now on; slots (S,) of
-    `SEAT`; rings (S, ring) of `FRAME`: frame n of a session is at index n modulo ring.
+    `SLOT`; rings (S, ring) of `FRAME`: frame n of a session is at index n modulo ring.
     """
 
     def __init__(self, descriptor: int, ring: int = RING) -> None:
@@ -52,9 +53,9 @@ class SharedTable(Closes):
         size = os.fstat(descriptor).st_size
         n_slots = size // _bytes_a_slot(ring)
         self._memory = mmap.mmap(descriptor, size)
-        self.slots: Slots = np.ndarray((n_slots,), SEAT, self._memory)
+        self.slots: Slots = np.ndarray((n_slots,), SLOT, self._memory)
         self.rings: Frames = np.ndarray(
-            (n_slots, ring), FRAME, self._memory, n_slots * SEAT.itemsize
+            (n_slots, ring), FRAME, self._memory, n_slots * SLOT.itemsize
         )
         self._taking = threading.Lock()
 
@@ -73,7 +74,7 @@ class SharedTable(Closes):
             os.close(self.descriptor)
             self.descriptor = -1
 
-    def take(self, session: int, worker: int) -> int:
+    def take(self, session: int) -> int:
         """Give a free slot to a session; returns its row, or UsageError if no slot is free."""
         with self._taking:
             free = np.flatnonzero(self.slots["state"] == FREE)
@@ -82,8 +83,7 @@ class SharedTable(Closes):
                     f"the host has {len(self.slots)} sessions, the most it takes: end one first"
                 )
             row = int(free[0])
-            self.slots[row] = np.zeros((), SEAT)
-            self.slots["worker"][row] = worker
+            self.slots[row] = np.zeros((), SLOT)
             self.slots["id"][row] = session
             self.slots["state"][row] = TAKEN
             return row
@@ -135,7 +135,7 @@ class SharedTable(Closes):
 
 
 def _bytes_a_slot(ring: int) -> int:
-    return SEAT.itemsize + ring * FRAME.itemsize
+    return SLOT.itemsize + ring * FRAME.itemsize
 
 
 def _attempts() -> Iterator[None]:

@@ -6,30 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.errors import HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.kernels.hand.calling import address_of_kernel
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.period import loop
 from hapticdb.kernels.period.following import USUAL_GAP_NS
-from hapticdb.kernels.records import (
-    BENDS,
-    FRAME,
-    MOST_MISSED,
-    NEAR,
-    PACE,
-    POINT,
-    RESULTS,
-    SEAT,
-    STATION,
-    pose_numbers,
-)
-from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Clusters, Place
+from hapticdb.kernels.records.cells import MISSED
+from hapticdb.kernels.records.hand import BENDS, FRAME, NEAR, POINT, RESULT
+from hapticdb.kernels.records.layout import pose_numbers
+from hapticdb.kernels.records.session import LOOP_CLOCK, SLOT
+from hapticdb.kernels.resident.cells import Cells, Clusters, Place
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, reads_distances
 from hapticdb.recording.frame import Frames
 from hapticdb.recording.header import Start
 from hapticdb.resident.held import clusters_of
-from hapticdb.resident.table import HEARTBEAT, CellTable
+from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import DirectRendering, Rendering, rendering_of
 
 LARGE_FROM = 4096
@@ -37,6 +30,8 @@ LARGE_FROM = 4096
 points. The results are the same: a larger value only costs time."""
 STALENESS_NS = 1_000_000_000
 """Longest silence (ns) of the database before all cells count as unknown for hosted hands."""
+LEAVE_PATIENCE = 5.0
+"""Seconds until the loop must have left an ending session; normally one period."""
 FOREVER = 1e9
 """Seconds for "no limit": thirty years."""
 
@@ -59,78 +54,55 @@ class SlotRequest:
 
 
 class SessionState:
-    """One session: its row of STATION, and the memory at the row's addresses.
+    """State of one session in its process: its slot, and the arrays at the slot's addresses.
 
-    Parameters
-    ----------
-    row : array
-        (1,) of STATION.
-    cells, reader : Cells, int
-        Cells of the session, and its row there.
-    session : array
-        (1,) of SESSION: its row on the request queue.
-    grid : Grid
-        Grid of the cells.
-    clusters : Clusters
-        The tool.
+    slot () : of `SLOT`, zero but for the fields of owner and client; cells, reader : of the
+    session; request () : its row of the request queue; grid : of the cells; clusters : the tool.
     """
 
     def __init__(
         self,
-        row: Record,
+        slot: Record,
         cells: Cells,
         reader: int,
-        session: Record,
+        request: Record,
         grid: Grid,
         clusters: Clusters,
     ) -> None:
-        row[:] = np.zeros((), STATION)
-        self.row, self.cells, self.reader, self.session = row, cells, reader, session
-        self.record = row[0, ...]
-        self.servo, self.follower = self.record["servo"], self.record["follower"]
+        self.slot, self.cells, self.reader, self.request = slot, cells, reader, request
+        self.servo, self.follower = slot["servo"], slot["follower"]
         self.clusters, n_points = clusters, len(clusters.points)
-        self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
         self.kept = np.zeros(n_points, POINT)
         self.near_points, self.bends = np.zeros((2, n_points), NEAR), np.zeros((2, n_points), BENDS)
-        self.met = np.zeros(n_points, dtype=np.int64)
-        self.pose, self.felt = np.eye(4), np.zeros(RESULTS)
-        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-        row["reader"], row["session"] = reader, session.ctypes.data
-        row["place"], row["bits"], row["curve"] = self.place, grid.bits, grid.curve_code
-        row["staleness"] = STALENESS_NS
-        self._write_cells()
-        self._write_tool()
-
-    def _write_cells(self) -> None:
-        """Write the addresses of the table's arrays."""
-        row, cells = self.row, self.cells
-        for name, array in cells._asdict().items():
-            row[name] = 0 if array is None else array.ctypes.data
-        row["n_control"], row["heartbeat"] = len(cells.control), HEARTBEAT
-        row["n_readers"] = len(cells.readers) // READER_STRIDE
-        row["n_slots"], row["capacity"] = len(cells.used), cells.keys.shape[1]
-
-    def _write_tool(self) -> None:
-        """Write the addresses of the tool's arrays."""
-        row, clusters = self.row, self.clusters
+        self.missed = np.zeros((), MISSED)
         self._arrays = {
-            name: np.ascontiguousarray(getattr(clusters, name))
-            for name in ("points", "center", "spheres", "groups", "columns", "scratch")
-        }
-        for name in ("met", "kept", "near_points", "bends", "pose", "felt", "missed"):
-            self._arrays[name] = getattr(self, name)
-        for name, array in self._arrays.items():
-            row[name] = array.ctypes.data
-        n_points = len(clusters.points)
-        row["n_points"], row["run"] = n_points, clusters.run
-        row["n_spheres"], row["n_groups"] = len(clusters.spheres), len(clusters.groups)
+            name: np.ascontiguousarray(array)
+            for name, array in clusters._asdict().items()
+            if name != "run"
+        } | {
+            "pose": np.eye(4), "felt": np.zeros((), RESULT), "missed": self.missed,
+            "met": np.zeros(n_points, np.int64), "kept": self.kept,
+            "near_points": self.near_points, "bends": self.bends,
+        }  # fmt: skip
+        for name, arrays in (("arrays", self._arrays), ("cells", cells._asdict())):
+            for field, array in arrays.items():
+                slot[name][field] = 0 if array is None else array.ctypes.data
+        for field, value in (
+            ("reader", reader), ("request", request.ctypes.data), ("staleness", STALENESS_NS),
+            ("place", Place(*grid.origin, grid.voxel_size, float(grid.side))), ("bits", grid.bits),
+            ("curve", grid.curve_code), ("n_readers", len(cells.readers)),
+            ("n_slots", len(cells.used)), ("capacity", cells.keys.shape[1]),
+            ("n_points", n_points), ("n_spheres", len(clusters.spheres)),
+            ("n_groups", len(clusters.groups)), ("run", clusters.run),
+        ):  # fmt: skip
+            slot[field] = value
         self.follower["is_large"] = n_points >= LARGE_FROM
 
     def set_spring(self, spring: DeviceSpring) -> None:
         """Replace the coupling; periods take the new one whole."""
-        which = 1 - int(self.row["coupling"][0])
-        self.row["springs"][:, which] = spring
-        self.row["coupling"] = which
+        which = 1 - int(self.slot["spring"])
+        self.slot["springs"][which] = spring
+        self.slot["spring"] = which
 
     def rest_at(self, pose: NDArray[np.float64]) -> None:
         """Put hand and tool at a pose (7,), at rest."""
@@ -157,17 +129,17 @@ class SessionState:
         self.follower["looker"] = looker
 
     def arrive_at(self, pose: NDArray[np.float64]) -> None:
-        """Take the hand from the shared table; its first pose is (7,)."""
-        way = self.record["way"]
-        way["start"], way["end"], way["seconds"] = pose, pose, 1e-9
-        self.row["source"], self.row["gap"] = loop.BOARD, USUAL_GAP_NS
+        """Take the hand from the slot's client; its first pose is (7,)."""
+        segment = self.slot["segment"]
+        segment["start"], segment["end"], segment["seconds"] = pose, pose, 1e-9
+        self.slot["source"], self.slot["gap"] = loop.HOSTED, USUAL_GAP_NS
 
 
 class PeriodClock:
     """Clock of all sessions of a process: runs their periods (`kernels.period.loop`).
 
-    law : of all sessions; slots, rings : of the shared table, with a state for each slot; unless
-    given, of one session alone; rendering : as of `rendering_of`.
+    law, rendering : of all sessions; slots, rings : of the shared table, or of one session alone;
+    worker : number of the process among those of the table.
     """
 
     def __init__(
@@ -176,30 +148,44 @@ class PeriodClock:
         slots: Record | None = None,
         rings: Frames | None = None,
         rendering: Rendering | None = None,
+        worker: int = 1,
     ) -> None:
-        self.law, self.rendering = law, rendering_of(rendering, law)
-        self.slots = slots = np.zeros(1, SEAT) if slots is None else slots
+        self.law, self.rendering, self.worker = law, rendering_of(rendering, law), worker
+        self.slots = np.zeros(1, SLOT) if slots is None else slots
         rings = np.zeros((1, 1), FRAME) if rings is None else rings
-        self.rows, self.record = np.zeros(len(slots), STATION), np.zeros((), PACE)
+        self._record = record = np.zeros((), LOOP_CLOCK)
         is_coupled = self.rendering == "coupled"
         mover = loop.move_by_coupling if is_coupled else loop.move_directly
-        self.record["mover"] = address_of_kernel(mover, loop.MOVER)
+        record["worker"], record["mover"] = worker, address_of_kernel(mover, loop.MOVER)
         if not is_coupled:
-            self.record["feeler"], self.record["law"], self._law = loop.feeler_of(law.for_kernels)
-        self._arguments = (self.rows, slots, rings, self.record)
-        self._times = self.record["due"], self.record["begun"], self.record["dt"]
+            record["feeler"], record["law"], self._law = loop.feeler_of(law.for_kernels)
+        self._arguments = (self.slots, rings, record)
+        self._times = record["due"], record["begun"], record["dt"]
 
     def add(self, request: SlotRequest, table: CellTable) -> SessionState:
-        """Make the state of a session; its periods run once `is_running` of its row is set."""
+        """Make the state of a session; its periods run from `enter` on."""
         cells = table.cells if reads_distances(self.law) else table.cells.without_distances()
-        n = int(np.flatnonzero(self.rows["is_running"] == 0)[0])
         state = SessionState(
-            self.rows[n : n + 1], cells, request.reader, table.queue.sessions[request.reader, ...],
-            request.grid, clusters_of(request.shell, request.grid.voxel_size),
+            self.slots[request.slot, ...], cells, request.reader,
+            table.queue.requests[request.reader, ...], request.grid,
+            clusters_of(request.shell, request.grid.voxel_size),
         )  # fmt: skip
-        state.row["seat"] = request.slot
         state.set_spring(request.coupling.spring())
         return state
+
+    def enter(self, state: SessionState) -> None:
+        """Run the periods of a session."""
+        state.slot["worker"] = self.worker
+
+    def leave(self, state: SessionState) -> None:
+        """Run no more periods of a session; the loop of another thread leaves it within two."""
+        state.slot["worker"] = 0
+        periods = self._record["periods"]
+        last, until = int(periods) + 2, time.monotonic() + LEAVE_PATIENCE
+        while int(periods) < last:
+            if time.monotonic() > until:
+                raise HapticDBError("a worker's loop hangs: end the host")
+            time.sleep(0.5e-9 * float(self._record["period"]))
 
     def run(self, rate: float, seconds: float = FOREVER) -> float:
         """Run periods at a rate until `stop` or for so long -> their time, s.
@@ -207,8 +193,9 @@ class PeriodClock:
         A long period misses the deadlines within it; the next one is due at the next deadline of
         the grid. The interpreter lock is free meanwhile.
         """
-        begun, record = time.monotonic_ns(), self.record
-        self.rows["began"] = self.rows["last"] = begun
+        begun, record = time.monotonic_ns(), self._record
+        own = self.slots["worker"] == self.worker
+        self.slots["began"][own] = self.slots["last"][own] = begun
         record["period"], record["most"] = round(1e9 / rate), max(round(seconds * rate), 1)
         record["due"] = begun + record["period"]
         loop.run(*self._arguments)
@@ -222,4 +209,4 @@ class PeriodClock:
 
     def stop(self) -> None:
         """End `run` after its period."""
-        self.record["is_over"] = 1
+        self._record["is_over"] = 1

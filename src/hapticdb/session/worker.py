@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import HapticDBError
 from hapticdb.query.law import ForceLaw
 from hapticdb.recording.header import Start
 from hapticdb.resident.table import CellTable
@@ -29,18 +28,16 @@ from hapticdb.session.processes.process import (
     reply_to_parent,
 )
 from hapticdb.session.shared_table import SharedTable
-from hapticdb.session.states import PeriodClock, SessionState, SlotRequest
+from hapticdb.session.states import LEAVE_PATIENCE, PeriodClock, SessionState, SlotRequest
 from hapticdb.session.timing import Timing, undisturbed
-
-LEAVE_PATIENCE = 5.0
-"""Seconds until the loop must have left an ending session; normally one period."""
 
 
 @dataclass(frozen=True)
 class WorkerRequest:
     """Sessions of a worker, all with the same shared table, timing, law and rendering.
 
-    alone : the only one, with a device; without it commands begin and end sessions.
+    alone : the only session, with a device; without it commands begin sessions; number : of the
+    worker, from 1.
     """
 
     shared: SharedTable
@@ -48,17 +45,17 @@ class WorkerRequest:
     law: ForceLaw
     rendering: Rendering
     alone: DeviceRequest | None = None
+    number: int = 1
 
 
 class Worker:
     """The sessions of one process and their loop.
 
-    The loop runs a session as soon as `is_running` of its state is set, and leaves it between two
-    periods after that is withdrawn.
+    The loop runs a session from `PeriodClock.enter` on, and leaves it between two periods.
     """
 
-    def __init__(self, shared: SharedTable, rate: float, clock: PeriodClock) -> None:
-        self._shared, self._rate, self._clock = shared, rate, clock
+    def __init__(self, rate: float, clock: PeriodClock) -> None:
+        self._rate, self._clock = rate, clock
         self._tables: dict[int, CellTable] = {}
         self._running: dict[int, tuple[int, SessionState]] = {}  # table and state, by slot
 
@@ -67,6 +64,7 @@ class Worker:
         try:
             while not parent_is_gone():
                 reply_to_parent(self._do, LOOK_EVERY)
+                self._forget_ended()
         except (EOFError, OSError):
             pass
         finally:
@@ -74,8 +72,7 @@ class Worker:
 
     def _do(self, ask: Message, descriptors: list[int]) -> object:
         known: dict[str, Callable[..., object]] = {
-            "begin": self._begin, "end": self._end, "save": self._save,
-            "set_coupling": self._set_coupling,
+            "begin": self._begin, "save": self._save, "set_coupling": self._set_coupling,
         }  # fmt: skip
         return known[ask.word](*descriptors, *ask.content)
 
@@ -88,15 +85,16 @@ class Worker:
         n_slots: int,
     ) -> None:
         """Begin a session, hand and tool at rest at a pose (7,); table : a name for its cells."""
+        self._forget_ended()  # a new table may have the name of theirs
         if table not in self._tables:
             self._tables[table] = CellTable(os.dup(descriptor), n_slots)
         state = self._clock.add(request, self._tables[table])
         state.rest_at(pose)
         state.arrive_at(pose)
-        state.row["is_frame"] = True
-        state.row["began"] = state.row["last"] = time.monotonic_ns()
+        state.slot["is_frame"] = True
+        state.slot["began"] = state.slot["last"] = time.monotonic_ns()
         self._running[request.slot] = table, state
-        state.row["is_running"] = 1
+        self._clock.enter(state)
 
     def _set_coupling(self, slot: int, coupling: DirectRendering) -> None:
         self._running[slot][1].set_spring(coupling.spring())
@@ -104,28 +102,18 @@ class Worker:
     def _save(self, slot: int) -> tuple[int, Start]:
         """Number of a session's next frame, and its state before that frame."""
         state = self._running[slot][1]
-        self._pause(state)
+        self._clock.leave(state)
         try:
-            return int(self._shared.slots["n_frames"][slot]), state.save()
+            return int(state.slot["n_frames"]), state.save()
         finally:
-            state.row["is_running"] = 1
+            self._clock.enter(state)
 
-    def _pause(self, state: SessionState) -> None:
-        """Take a session out of the loop."""
-        state.row["is_running"] = 0
-        periods = self._clock.record["periods"]
-        last, until = int(periods) + 2, time.monotonic() + LEAVE_PATIENCE
-        while int(periods) < last:
-            if time.monotonic() > until:
-                raise HapticDBError("a worker's loop hangs: end the host")
-            time.sleep(0.5 / self._rate)
-
-    def _end(self, slot: int) -> None:
-        table, state = self._running[slot]
-        self._pause(state)
-        state.session["told"]["is_active"] = False
-        del self._running[slot]
-        if all(used != table for used, _ in self._running.values()):
+    def _forget_ended(self) -> None:
+        """Free the memory of sessions that the loop has left."""
+        for slot, (_, state) in list(self._running.items()):
+            if state.slot["worker"] != self._clock.worker:
+                del self._running[slot]
+        for table in self._tables.keys() - {table for table, _ in self._running.values()}:
             self._tables.pop(table).close()
 
     def run(self) -> None:
@@ -137,11 +125,11 @@ class Worker:
 def work(request: WorkerRequest, sender: MessageSender) -> None:
     """Run a worker; the work of the process."""
     shared, timing = request.shared, request.timing
-    clock = PeriodClock(request.law, shared.slots, shared.rings, request.rendering)
+    clock = PeriodClock(request.law, shared.slots, shared.rings, request.rendering, request.number)
     if request.alone is not None:
         run_device(request.alone, timing, clock, sender)
         return
-    worker = Worker(shared, timing.rate, clock)
+    worker = Worker(timing.rate, clock)
     looping = threading.Thread(target=worker.run, daemon=True)
     looping.start()
     sender.send("ready", None)

@@ -42,7 +42,7 @@ def session(host: SessionHost, sphere: PointShell) -> Iterator[HostedSession]:
 
 def recording_of(host: SessionHost, session: HostedSession) -> Recorder:
     """The recording of a session, in the host."""
-    found = host._running[session.id].recording
+    found = host._supervisor.sessions[session.id].recording
     assert found is not None
     return found
 
@@ -96,7 +96,7 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
 
 def test_a_frame_that_is_never_finished_is_an_error() -> None:
     shared = SharedTable.create(1)
-    row = shared.take(7, 0)
+    row = shared.take(7)
     shared.slots["contacts_sequence"][row] = 1
     with pytest.raises(HapticDBError, match="stayed unfinished for 1 s"):
         shared.contacts(row)
@@ -122,7 +122,7 @@ def test_looking_after_sessions_survives_errors_and_logs_each_once(
         other.record(tmp_path / "other.hdbrec")
         with monkeypatch.context() as patch:
             patch.setattr(host.cells[0], "supervise", fail)
-            patch.setattr(host._running[session.id], "take_frames", fail)
+            patch.setattr(host._supervisor.sessions[session.id], "take_frames", fail)
             until(lambda: len(rounds) > 10)
             is_recorded_further(host, other)
     finally:
@@ -173,7 +173,7 @@ def test_a_recording_that_lost_frames_says_how_many(
 ) -> None:
     session.record(tmp_path / "late.hdbrec")
     is_recorded_further(host, session)
-    with host._running[session.id]._taking:
+    with host._supervisor.sessions[session.id]._taking:
         recording_of(host, session)._n_taken -= 3000  # as if nobody had looked for 6 s
     assert session.stop_recording() > 0
     assert session.lost_frames > 1000

@@ -7,7 +7,8 @@ import pytest
 
 from hapticdb import Grid, PointShell
 from hapticdb.devices.profiles import SCRIPTED
-from hapticdb.kernels.records import FRAME, SEAT
+from hapticdb.kernels.records.hand import FRAME
+from hapticdb.kernels.records.session import SLOT
 from hapticdb.kernels.resident.cell_table import publish
 from hapticdb.query.law import DISTANCE, PLANE
 from hapticdb.recording.frame import State
@@ -27,21 +28,22 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
     sphere: PointShell, *, reads_distances: bool
 ) -> None:
     """Others write just before its kernel begins, and again as soon as it has ended."""
-    grid, slots, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SEAT), np.zeros((1, 4), FRAME)
+    grid, slots, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SLOT), np.zeros((1, 4), FRAME)
     with CellTable.create(8 << 20, distances=reads_distances) as table, table.reading() as row:
         periods = PeriodClock(DISTANCE if reads_distances else PLANE, slots, rings)
         cells = table.cells if reads_distances else table.cells.without_distances()
         state = SessionState(
-            periods.rows,
+            slots[0, ...],
             cells,
             row,
-            table.queue.sessions[row, ...],
+            table.queue.requests[row, ...],
             grid,
             clusters_of(sphere, 0.01),
         )
         state.set_spring(Coupling().direct(SCRIPTED, 1.0, 0.024).spring())
         state.servo["hand"]["quaternion"][0] = state.servo["tool"]["quaternion"][0] = 1.0
-        state.row["is_running"] = state.row["is_frame"] = True
+        state.slot["is_frame"] = True
+        periods.enter(state)
         for revision in (7, 8, 9):
             publish(table.cells.control, revision - 6, revision)
             periods.step(1e-3, 0)

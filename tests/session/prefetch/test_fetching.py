@@ -17,9 +17,9 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.scripted import RandomHand
 from hapticdb.errors import DatabaseError, HapticDBError
 from hapticdb.kernels.period.telling import name_voxels
-from hapticdb.kernels.records import TOLD
-from hapticdb.kernels.resident.cells import LISTED, cell_key
-from hapticdb.resident.table import HEARTBEAT, LOST, CellTable
+from hapticdb.kernels.records.cells import PREFETCH_REQUEST
+from hapticdb.kernels.resident.cells import cell_key
+from hapticdb.resident.table import CellTable
 from hapticdb.session.prefetch.fetching import CONFIRM_EVERY, Fetcher, FetchRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.prefetch.tracking import PrefetchRequest
@@ -45,19 +45,18 @@ class Side:
         self.reader = Reader(table, grid, shell)
         self.grid = grid
         self.row = self.reader.row
-        self.session = table.queue.sessions[self.row, ...]
+        self.session = table.queue.requests[self.row, ...]
 
     def be_at(
         self, pose: Pose, velocity: NDArray[np.float64] | None = None
     ) -> tuple[list[int], bytes, int]:
         """Run a frame, write the state; return the frame's hits, wrench and unknown points."""
         found = self.reader.feel(pose)
-        told, missed = self.session["told"], self.reader.missed
+        told, missed = self.session["prefetch"], self.reader.missed
         told["is_active"], told["radius"] = True, RADIUS_M
         told["tool"] = told["handle"] = pose[:3, 3]
         told["velocity"] = 0.0 if velocity is None else velocity[:3]
-        self.session["n_missed"] = missed[LISTED]
-        self.session["missed"] = missed[LISTED + 1 :]
+        self.session["missed"] = missed
         self.session["sequence"] += 2
         return found
 
@@ -154,7 +153,7 @@ def world(tmp_path: Path) -> Environment:
 
 def told(*numbers: ArrayLike) -> NDArray[np.void]:
     """What a loop tells of its tool: places of tool and handle, the handle's velocity, radius."""
-    return np.array((True, *numbers), TOLD)
+    return np.array((True, *numbers), PREFETCH_REQUEST)
 
 
 # --- wanted cells -------------------------------------------------------------------------------
@@ -170,7 +169,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
     handle = tool + rng.normal(0, 0.02, 3)
     velocity = rng.normal(0, 0.5, 3)
     lookahead, radius = float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.0, 0.05))
-    request = PrefetchRequest.of_told(grid, told(tool, handle, velocity, radius), lookahead, 1.0)
+    request = PrefetchRequest.of_record(grid, told(tool, handle, velocity, radius), lookahead, 1.0)
     assert request is not None
     cells, urgency = request.cells(grid)
     wanted = set(cells.tolist())
@@ -194,7 +193,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
 def test_a_wish_too_large_keeps_what_is_near() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 16)
     tool = np.array([grid.edge * 0.9, 0.1, grid.edge / 2])
-    request = PrefetchRequest.of_told(
+    request = PrefetchRequest.of_record(
         grid, told(tool, tool, np.array([40.0, 0.0, 0.0]), 0.05), 0.5, 40.0
     )
     assert request is not None
@@ -209,7 +208,7 @@ def test_a_motion_that_is_none_wants_nothing() -> None:
     for broken in (np.nan, np.inf):
         nowhere = np.array([0.0, broken, 0.0])
         for motion in (told(rest, rest, nowhere, 0.0), told(rest, rest, rest, broken)):
-            assert PrefetchRequest.of_told(grid, motion, 0.1, 1.0) is None
+            assert PrefetchRequest.of_record(grid, motion, 0.1, 1.0) is None
 
 
 # --- in lock step -------------------------------------------------------------------------------
@@ -240,13 +239,13 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
                 step.fetcher.reopen()
             step.round()
             is_lost = False
-            assert not step.table.cells.control[LOST]
+            assert not step.table.cells.control["is_lost"]
         except DatabaseError:
             is_lost = True
             n_lost += 1
-            before = step.table.cells.control[HEARTBEAT]
+            before = step.table.cells.control["heartbeat"]
             step.wait(0.01)
-            assert step.table.cells.control[HEARTBEAT] == before
+            assert step.table.cells.control["heartbeat"] == before
     assert n_lost > 3
     step.hand = None
     step.fetcher.request = FetchRequest(world.url, step.table, world.grid)
@@ -273,21 +272,21 @@ def test_the_heartbeat_waits_for_an_answer(
 
     monkeypatch.setattr(step.fetcher.store, "revision", counted, raising=False)
     until(lambda: bool(asked), step.round)
-    heard = int(control[HEARTBEAT])
+    heard = int(control["heartbeat"])
     step.run(0.5 * CONFIRM_EVERY)
-    assert (len(asked), int(control[HEARTBEAT])) == (1, heard)
+    assert (len(asked), int(control["heartbeat"])) == (1, heard)
     step.run(CONFIRM_EVERY)
     assert len(asked) == 2
-    assert int(control[HEARTBEAT]) > heard
+    assert int(control["heartbeat"]) > heard
 
     def unanswered() -> int:
         raise hapticdb.errors.ConnectionLostError("gone")
 
     monkeypatch.setattr(step.fetcher.store, "revision", unanswered, raising=False)
-    heard = int(control[HEARTBEAT])
+    heard = int(control["heartbeat"])
     with pytest.raises(hapticdb.errors.ConnectionLostError):
         step.run(2 * CONFIRM_EVERY)
-    assert int(control[HEARTBEAT]) == heard
+    assert int(control["heartbeat"]) == heard
 
 
 def test_a_round_asks_nothing_when_nothing_has_moved(

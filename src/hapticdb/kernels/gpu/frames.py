@@ -17,8 +17,10 @@ from hapticdb.kernels import law as laws
 from hapticdb.kernels import rigid
 from hapticdb.kernels.gpu.sources import on_gpu
 from hapticdb.kernels.resident import cells
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS
 
+HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 6, 7, 8, 9, 10
+"""Rows of a block's sums behind the wrench, in the order of RESULT. Rows, because a reduction adds
+them all; the results of B frames are RESULTS rows, too, for coalesced writes."""
 WEIGHT = RESULTS
 """Row of a block's sums, after those of the results."""
 SUMS = RESULTS + 1

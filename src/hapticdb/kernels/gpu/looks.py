@@ -64,7 +64,7 @@ points (3, N + 1): m, last the centre; spheres (R, 4), or none for a small tool.
 run_due (R,): as in the record POINT; due_before, run_due_before: the values overwritten by the
 last query; epochs (R,) int64: epoch in which the run's `due` was written, valid only in the
 current one; seen (R,) int64: number of the last query of the run; due_runs (R,) int64: runs of
-the second launch. `asked` (1,): a query's LOOK. used (S,) uint8: slots read. missed
+the second launch. `asked` (1,): a query's QUERY. used (S,) uint8: slots read. missed
 (ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. `found` (FOUND,).
 points_near (M,) int64 and near (NEAR_NUMBERS, M): the near points, at most M, in host memory;
 values of neighbouring points are adjacent, for coalesced writes.

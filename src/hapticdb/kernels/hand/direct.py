@@ -8,9 +8,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.device_spring import at_device, shortened
-from hapticdb.kernels.hand.holding import is_somewhere, send
-from hapticdb.kernels.records import RESULTS
-from hapticdb.kernels.resident.cells import UNKNOWNS, WRENCH
+from hapticdb.kernels.hand.holding import is_somewhere, send, set_result
 from hapticdb.kernels.rigid import numbers_of, set_numbers
 
 
@@ -19,23 +17,23 @@ def render(terms, center, servo, frame, dt):
     """Move the tool to the hand, and send the wrench of the frame there to the device.
 
     terms : a `DeviceSpring`, with stiffness and damping unused; center (3,) : the tool's centre,
-    tool frame; servo : record of SERVO, with `hand` as input, `tool` and `sent` as output; frame
-    (RESULTS,) : result at the hand's pose. With a stale or non-finite hand, or points in unknown
+    tool frame; servo : record of SERVO, with `hand` as input, `tool` and `sent` as output; frame :
+    a RESULT, at the hand's pose. With a stale or non-finite hand, or points in unknown
     cells, the tool stays; its last wrench is sent for `hold` seconds and then falls to zero within
     `fade` seconds.
     """
     tool, hand = servo.tool, servo.hand
     is_lost = hand.is_stale or not is_somewhere(hand)
-    unknown = 0 if is_lost else np.int64(frame[UNKNOWNS])
+    unknown = 0 if is_lost else np.int64(frame.unknown)
     is_held = is_lost or unknown > 0
     if not is_held:
         set_numbers(tool, numbers_of(hand))
-        for n in range(RESULTS):
-            tool.felt[n] = frame[n]
-        force = shortened(frame[WRENCH], frame[WRENCH + 1], frame[WRENCH + 2], terms.cap)
-        torque = shortened(
-            frame[WRENCH + 3], frame[WRENCH + 4], frame[WRENCH + 5], terms.turn_cap * terms.scale
+        w = frame.wrench
+        set_result(
+            tool.felt, w, np.int64(frame.hits), np.int64(frame.contacts), unknown, frame.deepest
         )
+        force = shortened(w[0], w[1], w[2], terms.cap)
+        torque = shortened(w[3], w[4], w[5], terms.turn_cap * terms.scale)
         wrench = at_device(terms, hand, center, *force, *torque)
         for n in range(6):
             tool.kept[n] = wrench[n]

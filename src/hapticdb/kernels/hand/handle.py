@@ -3,7 +3,7 @@
 import math
 
 from hapticdb.kernels._jit import FLOATS, FLOATS2, INT, entry, leaf, record_of
-from hapticdb.kernels.records import HAND, HANDLE
+from hapticdb.kernels.records.hand import HAND, HANDLE
 from hapticdb.kernels.rigid import product, quaternion_in, set_numbers
 
 FARTHEST = 1e9

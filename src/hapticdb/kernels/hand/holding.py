@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import inlined, leaf
-from hapticdb.kernels.records import RESULTS
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS
+from hapticdb.kernels.law import NO_WRENCH
 from hapticdb.kernels.rigid import numbers_of, set_numbers
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT = 1, 2, 8, 16
@@ -32,12 +31,20 @@ def is_somewhere(hand):
 
 
 @leaf
+def set_result(result, wrench, hits, contacts, unknown, deepest):
+    """Write a RESULT; wrench : six numbers."""
+    for n in range(6):
+        result.wrench[n] = wrench[n]
+    result.hits, result.contacts = hits, contacts
+    result.unknown, result.deepest = unknown, deepest
+
+
+@leaf
 def begin_anew(tool):
     """Reset a tool's state to zero, except its position and quaternion."""
     for n in range(6):
         tool.kept[n] = 0.0
-    for n in range(RESULTS):
-        tool.felt[n] = 0.0
+    set_result(tool.felt, NO_WRENCH, 0, 0, 0, 0.0)
     for row in range(4):
         for column in range(4):
             tool.pose[row, column] = tool.tried_pose[row, column] = 0.0
@@ -64,8 +71,8 @@ def send(terms, servo, is_held, marks, dt):
     for n in range(6):
         sent.wrench[n] = share * tool.kept[n]
     sent.marks = marks | (IS_HELD if is_held else 0) | (IS_FADING if is_fading else 0)
-    sent.hits, sent.contacts = np.int64(tool.felt[HITS]), np.int64(tool.felt[CONTACTS])
-    sent.deepest = tool.felt[DEEPEST]
+    sent.hits, sent.contacts = np.int64(tool.felt.hits), np.int64(tool.felt.contacts)
+    sent.deepest = tool.felt.deepest
 
 
 @leaf

@@ -23,7 +23,6 @@ from hapticdb.kernels.field.spline import (
 from hapticdb.kernels.hand.calling import call
 from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
-    LISTED,
     UNKNOWN,
     brick_bit,
     cell_key,
@@ -217,8 +216,7 @@ Grasp = namedtuple(  # noqa: PYI024 - its types are those of the cells that a ke
 cells : `Cells` with distances; which : the frame's directory; shell : `Clusters`; place : the
 grid; follower : record of FOLLOWER; kept (N,) of POINT; near (2, N) of NEAR, bends (2, N) of
 BENDS : near points of two poses, in the order of the points, row `follower.side` for the tool's
-pose; met (N,) int64 : points in contact; missed (1 + MOST_MISSED,) int64 : unknown cells, as in
-`feeling.felt`.
+pose; met (N,) int64 : points in contact; missed : a MISSED, the unknown cells.
 """
 
 
@@ -229,7 +227,7 @@ def _look_at_run(grasp, run, transform, center):
     seen, points = seen_in(cells, which, cells.words), shell.points
     start, end = run * shell.run, min((run + 1) * shell.run, points.shape[0])
     payload, (cx, cy, cz), half = cells.payload, center, 1 - follower.side
-    travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed[LISTED]
+    travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed.n_cells
     merged, most_near = follower.merged, follower.merges_from
     last_key, slot, mask = np.int64(-1), np.int64(UNKNOWN), np.uint64(0)
     run_due = NEVER
@@ -275,7 +273,7 @@ def _look_at_run(grasp, run, transform, center):
             near.is_hollow = _write_bends(bends, bends_at(payload, slot, at, lever, looked))
         n_near += 1
     kept[run].run_due = run_due
-    follower.n_tried, missed[LISTED] = n_near, n_missed
+    follower.n_tried, missed.n_cells = n_near, n_missed
     return OPEN
 
 
@@ -294,7 +292,7 @@ def _look_at_due_runs(grasp, transform, center, way):
     """
     cells, which, shell, place, follower, kept, _, _, _, missed = grasp
     travelled = follower.travelled
-    follower.n_tried = follower.n_unknown = missed[LISTED] = 0
+    follower.n_tried = follower.n_unknown = missed.n_cells = 0
     for run in range(n_runs_of(shell)):
         due = kept[run].run_due
         if travelled < due:

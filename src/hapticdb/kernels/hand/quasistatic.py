@@ -29,6 +29,7 @@ from hapticdb.kernels.hand.holding import (
     is_somewhere,
     place_lost,
     send,
+    set_result,
 )
 from hapticdb.kernels.hand.near_points import (
     FLOOR,
@@ -55,7 +56,7 @@ from hapticdb.kernels.hand.steadying import (
     soften_change,
 )
 from hapticdb.kernels.hand.step import solve_step
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, WRENCH
+from hapticdb.kernels.law import NO_WRENCH
 from hapticdb.kernels.rigid import numbers_of, pose_of_quaternion
 
 IS_LOOSE, IS_SOFTER, IS_SNAPPING, IS_ANEW = 64, 128, 256, 512
@@ -209,8 +210,7 @@ def _record_felt(grasp, stiffness, felt):
     """
     follower, near, deepest = grasp.follower, grasp.near[grasp.follower.side], 0.0
     n_hits = n_contacts = 0
-    for n in range(felt.shape[0]):
-        felt[n] = 0.0
+    set_result(felt, NO_WRENCH, 0, 0, 0, 0.0)
     if not follower.is_loose:
         for m in range(follower.n_near):
             one = near[m]
@@ -224,9 +224,9 @@ def _record_felt(grasp, stiffness, felt):
                 deepest = max(deepest, depth)
                 for axis in range(3):
                     force = stiffness * depth
-                    felt[WRENCH + axis] += force * one.along[axis]
-                    felt[WRENCH + 3 + axis] += force * one.about[axis]
-    felt[HITS], felt[CONTACTS], felt[DEEPEST] = n_hits, n_contacts, deepest
+                    felt.wrench[axis] += force * one.along[axis]
+                    felt.wrench[3 + axis] += force * one.about[axis]
+    felt.hits, felt.contacts, felt.deepest = n_hits, n_contacts, deepest
 
 
 @leaf

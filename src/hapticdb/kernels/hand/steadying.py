@@ -3,7 +3,7 @@
 import math
 
 from hapticdb.kernels._jit import leaf
-from hapticdb.kernels.records import MOST_TRAIL
+from hapticdb.kernels.records.hand import MOST_TRAIL
 
 WINDOW = 4e-3
 """Seconds of the hand's speed measurement. Larger: later damping; over one sample, a device's

@@ -22,51 +22,51 @@ SILENCE_NS = 250_000_000
 
 
 @leaf
-def _take_arrival(station, seat, hand, now):
-    """Start a segment to a new pose in the session's slot (a seqlock), unless half-written."""
-    sequence = seat.hand_sequence
-    if sequence == station.seen or sequence & 1:
+def _take_arrival(slot, hand, now):
+    """Start a segment to a new pose in the slot (a seqlock), unless half-written."""
+    sequence = slot.hand_sequence
+    if sequence == slot.seen or sequence & 1:
         return
     fence()
-    arrived, is_held = seat.hand_time, seat.is_held
-    pose, way = seat.hand_pose, station.way
+    arrived, is_held = slot.hand_time, slot.is_held
+    pose, segment = slot.hand_pose, slot.segment
     for n in range(7):
-        way.arriving[n] = pose[n]
+        segment.arriving[n] = pose[n]
     fence()
-    if seat.hand_sequence != sequence:
+    if slot.hand_sequence != sequence:
         return  # overwritten during the read: the next period retries
-    gap = arrived - station.arrived
-    station.arrived, station.seen = arrived, sequence
+    gap = arrived - slot.arrived
+    slot.arrived, slot.seen = arrived, sequence
     if 0 < gap < SILENCE_NS:
-        station.gap += (min(gap, LONGEST_GAP_NS) - station.gap) // 2
+        slot.gap += (min(gap, LONGEST_GAP_NS) - slot.gap) // 2
     if not is_held:
-        station.is_let_go = 1
+        slot.is_let_go = 1
         return
     # after a release the hand starts at the pose of its arrival, without a segment
-    is_new = station.is_let_go != 0
+    is_new = slot.is_let_go != 0
     for n in range(3):
-        way.start[n] = way.arriving[n] if is_new else hand.position[n]
-        way.end[n] = way.arriving[n]
+        segment.start[n] = segment.arriving[n] if is_new else hand.position[n]
+        segment.end[n] = segment.arriving[n]
     for n in range(4):
-        way.start[3 + n] = way.arriving[3 + n] if is_new else hand.quaternion[n]
-        way.end[3 + n] = way.arriving[3 + n]
-    station.is_let_go = 0
-    way.began, way.seconds = now, STRETCH * 1e-9 * station.gap
+        segment.start[3 + n] = segment.arriving[3 + n] if is_new else hand.quaternion[n]
+        segment.end[3 + n] = segment.arriving[3 + n]
+    slot.is_let_go = 0
+    segment.began, segment.seconds = now, STRETCH * 1e-9 * slot.gap
 
 
 @leaf
-def follow_arrivals(station, seat, hand, now):
+def follow_arrivals(slot, hand, now):
     """Write the hand's pose and velocity at a time, ns; position NaN while the hand is released."""
-    _take_arrival(station, seat, hand, now)
+    _take_arrival(slot, hand, now)
     position, turned, velocity = hand.position, hand.quaternion, hand.velocity
-    if station.is_let_go:
+    if slot.is_let_go:
         position[0] = math.nan
         return
-    way = station.way
-    start, end = way.start, way.end
-    passed = 1e-9 * (now - way.began)
-    share = 1.0 if passed >= way.seconds else passed / way.seconds
-    rate = 0.0 if share == 1.0 else 1.0 / way.seconds
+    segment = slot.segment
+    start, end = segment.start, segment.end
+    passed = 1e-9 * (now - segment.began)
+    share = 1.0 if passed >= segment.seconds else passed / segment.seconds
+    rate = 0.0 if share == 1.0 else 1.0 / segment.seconds
     w, x, y, z = start[3], start[4], start[5], start[6]
     tx, ty, tz = turn_of(*product(end[3], end[4], end[5], end[6], w, -x, -y, -z))
     w, x, y, z = product(*quaternion_by(share * tx, share * ty, share * tz), w, x, y, z)

@@ -7,8 +7,8 @@ allocation, no compilation and no query of the database, and runs without the in
 kernels of tool motion and of a frame are called by address: they compile in parallel with the loop,
 and the loop compiles once for all laws.
 
-Another thread adds and removes sessions: it sets `is_running` of a station after all other fields,
-and may free a station two periods after clearing it.
+Another thread adds sessions: it sets `worker` of a slot after all other fields. The loop clears it
+when the session is asked to end, or its cells are closed.
 """
 
 from typing import Any
@@ -47,10 +47,10 @@ from hapticdb.kernels.period.telling import (
     show_objects,
     tell,
 )
-from hapticdb.kernels.records import FRAME, PACE, SEAT, SESSION, STATION
+from hapticdb.kernels.records.cells import REQUEST
+from hapticdb.kernels.records.hand import FRAME
+from hapticdb.kernels.records.session import LOOP_CLOCK, SLOT
 from hapticdb.kernels.resident.cells import (
-    FELT_REVISION,
-    READER_STRIDE,
     begin_frame,
     end_frame,
 )
@@ -58,9 +58,9 @@ from hapticdb.kernels.resident.feeling import felt
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import is_rigid, numbers_of, pose_of_quaternion
 
-GIVEN, BOARD, DEVICE, NOBODY = 0, 1, 2, 3
-"""Sources of a session's hand: the caller; the session's slot in the shared table; the device's
-reading in the station; none, and only the times of its periods are counted."""
+GIVEN, HOSTED, DEVICE, NOBODY = 0, 1, 2, 3
+"""Sources of a session's hand: the caller; the client of a hosted hand; the device's reading; none,
+and only the times of its periods are counted."""
 TELL_EVERY_NS = 900_000
 """Nanoseconds between two prefetch requests. Larger: cells are requested later. Smaller: the loop
 computes more."""
@@ -72,55 +72,57 @@ WITHDRAWN_NS = 250_000_000
 least this much later: by then the ids have been published and read."""
 
 
-MOVER = from_dtype(STATION), from_dtype(SEAT), from_dtype(PACE)
+MOVER = from_dtype(SLOT), INT, from_dtype(LOOP_CLOCK)
 PLANE, DISTANCE = types.CPointer(TANGENT_PLANE), types.CPointer(DISTANCE_FIELD)
 """Argument types of the kernels of tool motion, and of a pointer to a law's numbers."""
 
 
 @entry(*MOVER, by_address=True)
-def move_by_coupling(station, seat, pace):
-    """Move the tool of a session to the equilibrium of spring and contacts."""
-    shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
-    cells, servo, at = cells_of(station), station.servo, station.reader * READER_STRIDE
-    tool, sent, follower, spring = servo.tool, servo.sent, station.follower, spring_of(station)
-    which = begin_frame(cells, station.reader)
+def move_by_coupling(slot, which, clock):
+    """Move the tool of a session to the equilibrium of spring and contacts.
+
+    which : the frame's directory of cells.
+    """
+    shell, place, memory = tool_of(slot), grid_of(slot), memory_of(slot)
+    cells, servo = cells_of(slot), slot.servo
+    tool, sent, follower, spring = servo.tool, servo.sent, slot.follower, spring_of(slot)
+    version = cells.readers[slot.reader].version
     grasp = Grasp(
         cells, which, shell, place, follower, memory.kept, memory.near, memory.bends, memory.met,
-        memory.missed,
+        memory.missed[0],
     )  # fmt: skip
-    is_anew = tool.version != cells.readers[at]
-    advance(grasp, cells.readers[at], spring, servo, pace.dt)
+    is_anew = tool.version != version
+    advance(grasp, version, spring, servo, clock.dt)
     sent.marks |= IS_ANEW if is_anew else 0
     pose_of_quaternion(*numbers_of(tool), memory.pose)
-    sent.revision = cells.readers[at + FELT_REVISION]
-    end_frame(cells, station.reader)
-    if station.begun - station.shown_at >= SHOW_EVERY_NS:
-        station.shown_at = station.begun
-        show_contacts(seat, grasp, memory.pose, spring)
-    station.n_touching = list_touching(grasp, sent.hits)
+    sent.revision = cells.readers[slot.reader].revision
+    if slot.begun - slot.shown_at >= SHOW_EVERY_NS:
+        slot.shown_at = slot.begun
+        show_contacts(slot, grasp, memory.pose, spring)
+    slot.n_touching = list_touching(grasp, sent.hits)
     return 0
 
 
 _cells = chosen_by_type(
     lambda law_type: (
-        (lambda law, station: cells_of(station))  # noqa: ARG005
+        (lambda law, slot: cells_of(slot))  # noqa: ARG005
         if law_type is DistanceFieldLaw
-        else (lambda law, station: voxels_of(station))  # noqa: ARG005
+        else (lambda law, slot: voxels_of(slot))  # noqa: ARG005
     )
 )
-"""Cells of a station, with distances for `DistanceFieldLaw`."""
+"""Cells of a slot, with distances for `DistanceFieldLaw`."""
 
 
-@entry(from_dtype(STATION), INT, PLANE, also={PLANE: DISTANCE}, by_address=True)
-def feel(station, which, laws):
-    """Compute the law's frame at `station.pose`, into `station.felt` and `station.met`.
+@entry(from_dtype(SLOT), INT, PLANE, also={PLANE: DISTANCE}, by_address=True)
+def feel(slot, which, laws):
+    """Compute the law's frame at the pose of `memory_of(slot)`, into its `felt` and `met`.
 
     which : index of the directory of cells; laws : pointer to the law.
     """
-    law, memory = laws[0], memory_of(station)
+    law, memory = laws[0], memory_of(slot)
     felt(
-        law, _cells(law, station), which, tool_of(station), memory.pose, grid_of(station),
-        memory.met, memory.missed, memory.felt,
+        law, _cells(law, slot), which, tool_of(slot), memory.pose, grid_of(slot),
+        memory.met, memory.missed[0], memory.felt[0],
     )  # fmt: skip
     return 0
 
@@ -128,10 +130,10 @@ def feel(station, which, laws):
 def feeler_of(numbers: Any) -> tuple[int, int, Any]:  # noqa: ANN401 - a law's NamedTuple
     """Addresses of `feel` for a law and of the law's numbers, and their owner, to be referenced."""
     if config.DISABLE_JIT:
-        plain = lambda station, which, _: feel(station, which, [numbers])  # noqa: E731
+        plain = lambda slot, which, _: feel(slot, which, [numbers])  # noqa: E731
         return address_of_kernel(plain, ()), 0, plain
     kind = numba.typeof(numbers)
-    address = address_of_kernel(feel, (from_dtype(STATION), INT, types.CPointer(kind)))
+    address = address_of_kernel(feel, (from_dtype(SLOT), INT, types.CPointer(kind)))
     kept = np.array(_packed(numbers), _layout_of(kind))
     return address, kept.ctypes.data, (kept, numbers)
 
@@ -159,127 +161,129 @@ def _packed(value: Any) -> Any:  # noqa: ANN401 - likewise
 
 
 @entry(*MOVER, by_address=True)
-def move_directly(station, seat, pace):  # noqa: ARG001 - as `move_by_coupling`
+def move_directly(slot, which, clock):
     """Place the tool of a session at the hand and send the law's wrench there: direct rendering."""
-    cells, servo, memory = voxels_of(station), station.servo, memory_of(station)
+    servo, memory = slot.servo, memory_of(slot)
     sent = servo.sent
     pose_of_quaternion(*numbers_of(servo.hand), memory.pose)
     if is_rigid(memory.pose):
-        which = begin_frame(cells, station.reader)
-        call_kernel(pace.feeler, station, which, pace.law)
-        sent.revision = cells.readers[station.reader * READER_STRIDE + FELT_REVISION]
-        end_frame(cells, station.reader)
-    render(spring_of(station), tool_of(station).center, servo, memory.felt, pace.dt)
+        call_kernel(clock.feeler, slot, which, clock.law)
+        sent.revision = voxels_of(slot).readers[slot.reader].revision
+    render(spring_of(slot), tool_of(slot).center, servo, memory.felt[0], clock.dt)
     pose_of_quaternion(*numbers_of(servo.tool), memory.pose)
-    station.n_touching = sent.hits
+    slot.n_touching = sent.hits
     return 0
 
 
 @leaf
-def _ask_objects(station, seat, session, shell, place, memory, heartbeat):
+def _ask_objects(slot, request, shell, place, memory, heartbeat):
     """Request the ids of touched objects from the fetching process, and publish those received.
 
     A request without end would be answered again at each write, for voxels no longer touched. A
     request withdrawn immediately would never be answered by a slow database.
     """
-    sent = station.servo.sent
+    sent = slot.servo.sent
     if sent.hits > 0 or sent.marks & IS_LOOSE:
         name_voxels(
-            session, shell, memory.pose, place, station.bits, station.curve, memory.met,
-            station.n_touching,
+            request, shell, memory.pose, place, slot.bits, slot.curve, memory.met,
+            slot.n_touching,
         )  # fmt: skip
-        station.asked_at = station.begun
-    elif station.asked_at != 0 and heartbeat > station.asked_at + WITHDRAWN_NS:
-        session.n_asked = station.asked_at = 0
-    show_objects(seat, session)
+        slot.asked_at = slot.begun
+    elif slot.asked_at != 0 and heartbeat > slot.asked_at + WITHDRAWN_NS:
+        request.n_asked = slot.asked_at = 0
+    show_objects(slot, request)
 
 
 @leaf
-def _run_period(station, seat, ring, pace):
-    """Run one period of a session, due at `pace.due` and started at `pace.begun`."""
-    servo, begun = station.servo, pace.begun
-    lateness = 1e-9 * (begun - pace.due)
-    if station.source == NOBODY:
-        count_times(seat, lateness, 1e-9 * (now_ns(pace.moment) - begun))
-        seat.n_frames += 1
+def _run_period(slot, ring, clock):
+    """Run one period of a session, due at `clock.due` and started at `clock.begun`."""
+    servo, begun = slot.servo, clock.begun
+    lateness = 1e-9 * (begun - clock.due)
+    if slot.source == NOBODY:
+        count_times(slot, lateness, 1e-9 * (now_ns(clock.moment) - begun))
+        slot.n_frames += 1
         return
     hand, sent = servo.hand, servo.sent
-    shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
-    session = array_at(station.session, (), SESSION)[()]
-    heartbeat = array_at(station.control, (station.n_control,), np.int64)[station.heartbeat]
-    station.begun, reading = begun, station.reading
-    station.used_coupling = station.coupling
-    if station.source == BOARD:
-        follow_arrivals(station, seat, hand, begun)
-    elif station.source == DEVICE:
-        if station.reads != 0 and call(station.reads) != 0:
-            pace.is_over = 1
+    shell, place, memory = tool_of(slot), grid_of(slot), memory_of(slot)
+    request = array_at(slot.request, (), REQUEST)[()]
+    cells = voxels_of(slot)
+    heartbeat = cells.control[()].heartbeat
+    slot.begun, reading = begun, slot.reading
+    slot.used_spring = slot.spring
+    if slot.source == HOSTED:
+        follow_arrivals(slot, hand, begun)
+    elif slot.source == DEVICE:
+        if slot.reads != 0 and call(slot.reads) != 0:
+            clock.is_over = 1
             return
-        follow_reading(station.handle, reading.pose, reading.velocity, reading.buttons, hand)
-    hand.is_stale = begun - heartbeat > station.staleness
-    call_kernel(pace.mover, station, seat, pace)
-    if station.pushes != 0 and call(station.pushes) != 0:
-        pace.is_over = 1
-    if begun - station.told_at >= TELL_EVERY_NS or sent.unknown > 0 or not station.is_frame:
-        station.told_at = begun
+        follow_reading(slot.handle, reading.pose, reading.velocity, reading.buttons, hand)
+    hand.is_stale = begun - heartbeat > slot.staleness
+    call_kernel(clock.mover, slot, begin_frame(cells, slot.reader), clock)
+    end_frame(cells, slot.reader)
+    if slot.pushes != 0 and call(slot.pushes) != 0:
+        clock.is_over = 1
+    if begun - slot.requested_at >= TELL_EVERY_NS or sent.unknown > 0 or not slot.is_frame:
+        slot.requested_at = begun
         tell(
-            session, hand, station.is_let_go, memory.pose, shell.center, spring_of(station).radius,
-            memory.missed,
+            request, hand, slot.is_let_go, memory.pose, shell.center, spring_of(slot).radius,
+            memory.missed[0],
         )  # fmt: skip
-    if not station.is_frame:
+    if not slot.is_frame:
         return
-    if begun - station.looked_at >= ASK_EVERY_NS:
-        station.looked_at = begun
-        _ask_objects(station, seat, session, shell, place, memory, heartbeat)
-    station.last = begun
-    elapsed = 1e-9 * (now_ns(pace.moment) - begun)
-    time = 1e-9 * (begun - station.began)
-    note(ring, seat.n_frames, time, pace.dt, lateness, elapsed, station)
-    count(seat, servo, station.follower)
-    count_times(seat, lateness, elapsed)
+    if begun - slot.answered_at >= ASK_EVERY_NS:
+        slot.answered_at = begun
+        _ask_objects(slot, request, shell, place, memory, heartbeat)
+    slot.last = begun
+    elapsed = 1e-9 * (now_ns(clock.moment) - begun)
+    time = 1e-9 * (begun - slot.began)
+    note(ring, slot, time, clock.dt, lateness, elapsed)
+    count(slot)
+    count_times(slot, lateness, elapsed)
     fence()
-    seat.n_frames += 1
+    slot.n_frames += 1
+    if slot.is_asked_to_end or cells.control[()].is_over:
+        slot.worker = 0
+        if slot.source == DEVICE:
+            clock.is_over = 1
 
 
 @leaf
-def _count_missed(stations, seats, pace):
+def _count_missed(slots, clock):
     """Count the deadlines passed during a period, as missed by all sessions; set the next one."""
-    done = now_ns(pace.moment)
-    pace.due += pace.period
-    behind = (done - pace.due) // pace.period + 1 if done > pace.due else np.int64(0)
-    for n in range(stations.shape[0]):
-        if stations[n].is_running:
-            seat = seats[stations[n].seat]
-            seat.missed += behind
-    pace.due += behind * pace.period
-    pace.passed += 1 + behind
+    done = now_ns(clock.moment)
+    clock.due += clock.period
+    behind = (done - clock.due) // clock.period + 1 if done > clock.due else np.int64(0)
+    for n in range(slots.shape[0]):
+        if slots[n].worker == clock.worker:
+            slots[n].missed_deadlines += behind
+    clock.due += behind * clock.period
+    clock.passed += 1 + behind
 
 
-@entry(record_of(STATION, 1), record_of(SEAT, 1), record_of(FRAME, 2), record_of(PACE))
-def run(stations, seats, rings, pace_record):
-    """Run one period of all sessions, or periods until `pace.is_over` or `pace.most` deadlines.
+@entry(record_of(SLOT, 1), record_of(FRAME, 2), record_of(LOOP_CLOCK))
+def run(slots, rings, clock_record):
+    """Run a period of a worker's sessions, or periods until `clock.is_over` or `clock.most`.
 
-    stations (S,) of STATION: the sessions; seats (B,) and rings (B, R): the shared table;
-    pace_record () of PACE, with the kernel of motion for all tools: `move_by_coupling`, or
-    `move_directly`. If the frames of a period take longer than it, all sessions miss the deadlines
-    within that time.
+    slots (S,) and rings (S, R): the shared table; clock_record () of LOOP_CLOCK, with the kernel of
+    motion for all tools: `move_by_coupling`, or `move_directly`. If the frames of a period take
+    longer than it, all sessions miss the deadlines within that time.
     """
-    pace = pace_record[()]
-    is_alone = pace.period > 0
+    clock = clock_record[()]
+    is_alone = clock.period > 0
     while True:
         if is_alone:
-            wait_until(pace.moment, pace.due)
-        for n in range(stations.shape[0]):
-            station = stations[n]
-            if station.is_running:
+            wait_until(clock.moment, clock.due)
+        for n in range(slots.shape[0]):
+            slot = slots[n]
+            if slot.worker == clock.worker:
                 if is_alone:
-                    pace.begun = now_ns(pace.moment)
-                    pace.dt = 1e-9 * (pace.begun - station.last)
-                _run_period(station, seats[station.seat], rings[station.seat], pace)
+                    clock.begun = now_ns(clock.moment)
+                    clock.dt = 1e-9 * (clock.begun - slot.last)
+                _run_period(slot, rings[n], clock)
         if not is_alone:
             return
-        _count_missed(stations, seats, pace)
+        _count_missed(slots, clock)
         fence()
-        pace.periods += 1
-        if pace.is_over or pace.passed >= pace.most:
+        clock.periods += 1
+        if clock.is_over or clock.passed >= clock.most:
             return

@@ -1,6 +1,6 @@
 """Arrays at addresses: cells and tools of a variable number of sessions, in one kernel.
 
-Sessions have tools and tables of different sizes. A record (`kernels.records.STATION`) contains the
+Sessions have tools and tables of different sizes. A slot (`kernels.records.session.SLOT`) has the
 addresses and sizes of their arrays, and kernels make array views from them.
 """
 
@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.field.lattice import CELL_VALUES
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.records import BENDS, MOST_MISSED, NEAR, POINT, RESULTS
+from hapticdb.kernels.records.cells import BUFFERS, CONTROL, MISSED, READER
+from hapticdb.kernels.records.hand import BENDS, NEAR, POINT, RESULT
 from hapticdb.kernels.resident.cells import (
-    BUFFERS,
     CELL_WORDS,
-    READER_STRIDE,
     SCRATCH_ROWS,
     Cells,
     Clusters,
@@ -60,62 +59,61 @@ else:
 
 
 @leaf
-def _cells_with(station, payload, near):
+def _cells_with(slot, payload, near):
     """Cells of a session; payload, near : arrays of distances, or None."""
-    n_slots, capacity = station.n_slots, station.capacity
+    at, n_slots, capacity = slot.cells, slot.n_slots, slot.capacity
     return Cells(
-        array_at(station.control, (station.n_control,), np.int64),
-        array_at(station.readers, (station.n_readers * READER_STRIDE,), np.int64),
-        array_at(station.keys, (BUFFERS, capacity), np.int64),
-        array_at(station.slots, (BUFFERS, capacity), np.int32),
-        array_at(station.words, (n_slots, CELL_WORDS), np.uint32),
-        array_at(station.masks, (n_slots,), np.uint64),
-        array_at(station.used, (n_slots,), np.uint8),
+        array_at(at.control, (), CONTROL),
+        array_at(at.readers, (slot.n_readers,), READER),
+        array_at(at.keys, (BUFFERS, capacity), np.int64),
+        array_at(at.slots, (BUFFERS, capacity), np.int32),
+        array_at(at.words, (n_slots, CELL_WORDS), np.uint32),
+        array_at(at.masks, (n_slots,), np.uint64),
+        array_at(at.used, (n_slots,), np.uint8),
         payload,
         near,
     )
 
 
 @leaf
-def voxels_of(station):
+def voxels_of(slot):
     """Cells of a session, without distances."""
-    return _cells_with(station, None, None)
+    return _cells_with(slot, None, None)
 
 
 @leaf
-def cells_of(station):
+def cells_of(slot):
     """Cells of a session, with distances."""
-    payload = array_at(station.payload, (station.n_slots, CELL_VALUES), np.uint8)
-    near = array_at(station.near, (station.n_slots, CELL_WORDS), np.uint32)
-    return _cells_with(station, payload, near)
+    payload = array_at(slot.cells.payload, (slot.n_slots, CELL_VALUES), np.uint8)
+    near = array_at(slot.cells.near, (slot.n_slots, CELL_WORDS), np.uint32)
+    return _cells_with(slot, payload, near)
 
 
 @leaf
-def tool_of(station):
-    """Tool of a session."""
-    n_points = station.n_points
+def tool_of(slot):
+    """Tool of a request."""
+    at, n_points = slot.arrays, slot.n_points
     return Clusters(
-        array_at(station.points, (n_points, 6), np.float64),
-        array_at(station.center, (3,), np.float64),
-        array_at(station.spheres, (station.n_spheres, 4), np.float64),
-        array_at(station.groups, (station.n_groups, 4), np.float64),
-        station.run,
-        array_at(station.columns, (3, n_points), np.float64),
-        array_at(station.scratch, (SCRATCH_ROWS, station.run), np.float64),
+        array_at(at.points, (n_points, 6), np.float64),
+        array_at(at.center, (3,), np.float64),
+        array_at(at.spheres, (slot.n_spheres, 4), np.float64),
+        array_at(at.groups, (slot.n_groups, 4), np.float64),
+        slot.run,
+        array_at(at.columns, (3, n_points), np.float64),
+        array_at(at.scratch, (SCRATCH_ROWS, slot.run), np.float64),
     )
 
 
 class Memory(NamedTuple):
     """Arrays shared by the parts of a period.
 
-    pose (4, 4): of the tool; `felt` (RESULTS,): the law's frame; missed (1 + MOST_MISSED,): unknown
-    cells, as from `feeling.felt`; `met`, `kept`, near, bends: of the tool's points, as in
-    `near_points.Grasp`.
+    pose (4, 4): of the tool; `felt`, missed (1,) of RESULT and MISSED: the law's frame, as from
+    `feeling.felt`; `met`, `kept`, near, bends: of the tool's points, as in `near_points.Grasp`.
     """
 
     pose: NDArray[np.float64]
-    felt: NDArray[np.float64]
-    missed: NDArray[np.int64]
+    felt: NDArray[np.void]
+    missed: NDArray[np.void]
     met: NDArray[np.int64]
     kept: NDArray[np.void]
     near: NDArray[np.void]
@@ -123,29 +121,29 @@ class Memory(NamedTuple):
 
 
 @leaf
-def memory_of(station):
+def memory_of(slot):
     """Arrays shared by the parts of a session's period."""
-    n_points = station.n_points
+    at, n_points = slot.arrays, slot.n_points
     return Memory(
-        array_at(station.pose, (4, 4), np.float64),
-        array_at(station.felt, (RESULTS,), np.float64),
-        array_at(station.missed, (1 + MOST_MISSED,), np.int64),
-        array_at(station.met, (n_points,), np.int64),
-        array_at(station.kept, (n_points,), POINT),
-        array_at(station.near_points, (2, n_points), NEAR),
-        array_at(station.bends, (2, n_points), BENDS),
+        array_at(at.pose, (4, 4), np.float64),
+        array_at(at.felt, (1,), RESULT),
+        array_at(at.missed, (1,), MISSED),
+        array_at(at.met, (n_points,), np.int64),
+        array_at(at.kept, (n_points,), POINT),
+        array_at(at.near_points, (2, n_points), NEAR),
+        array_at(at.bends, (2, n_points), BENDS),
     )
 
 
 @leaf
-def grid_of(station):
-    """Grid of a session."""
-    place = station.place
+def grid_of(slot):
+    """Grid of a request."""
+    place = slot.place
     return Place(place[0], place[1], place[2], place[3], place[4])
 
 
 @leaf
-def spring_of(station):
-    """Coupling of a session."""
-    n = station.springs[station.used_coupling]
+def spring_of(slot):
+    """Coupling of a request."""
+    n = slot.springs[slot.used_spring]
     return DeviceSpring(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])

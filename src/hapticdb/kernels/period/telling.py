@@ -10,8 +10,9 @@ from hapticdb.kernels.hand.device_spring import contact_stiffness
 from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD
 from hapticdb.kernels.hand.near_points import FLOOR, depth_of
 from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_LOOSE, IS_SOFTER
-from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
-from hapticdb.kernels.resident.cells import LISTED, in_voxels
+from hapticdb.kernels.records.cells import MOST_ASKED
+from hapticdb.kernels.records.session import MOST_SHOWN, TIME_BIN, TIME_BINS
+from hapticdb.kernels.resident.cells import in_voxels
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import length_at, moved, transform_of, turned
 
@@ -20,16 +21,15 @@ HELD, FADING, CLUTCH_OPEN, IN_OBJECT, STALE, ANEW = 1, 2, 4, 8, 16, 32
 
 
 @leaf
-def tell(session, hand, is_let_go, pose, center, radius, missed):
+def tell(request, hand, is_let_go, pose, center, radius, missed):
     """Write a prefetch request: tool, hand and the unknown cells of the last query.
 
-    session : a SESSION of the request queue, a seqlock: its sequence number is odd during a write;
-    pose (4, 4), center (3,): of the tool; radius : of its farthest point; missed (1 + MOST_MISSED,)
-    as from `feeling.felt`.
+    request : a REQUEST, a seqlock: its sequence number is odd during a write; pose (4, 4), center
+    (3,): of the tool; radius : of its farthest point; missed : a MISSED.
     """
-    told, transform = session.told, transform_of(pose)
+    told, transform = request.prefetch, transform_of(pose)
     x, y, z = moved(transform, center[0], center[1], center[2])
-    session.sequence += 1
+    request.sequence += 1
     fence()
     told.is_active = True
     told.tool[0], told.tool[1], told.tool[2] = x, y, z
@@ -41,15 +41,15 @@ def tell(session, hand, is_let_go, pose, center, radius, missed):
     told.handle[0], told.handle[1], told.handle[2] = x, y, z
     for axis in range(3):
         told.velocity[axis] = 0.0 if is_let_go else hand.velocity[axis]
-    session.n_missed = missed[LISTED]
-    for n in range(missed[LISTED]):
-        session.missed[n] = missed[LISTED + 1 + n]
+    request.missed.n_cells = missed.n_cells
+    for n in range(missed.n_cells):
+        request.missed.cells[n] = missed.cells[n]
     fence()
-    session.sequence += 1
+    request.sequence += 1
 
 
 @leaf
-def name_voxels(session, shell, pose, place, bits, curve, met, n_hits):
+def name_voxels(request, shell, pose, place, bits, curve, met, n_hits):
     """Request the ids of the objects in the voxels hit by a placed shell: write the voxels' keys.
 
     `met` (n_hits,): indices of the hits, decimated to at most MOST_ASKED.
@@ -62,9 +62,9 @@ def name_voxels(session, shell, pose, place, bits, curve, met, n_hits):
         x, y, z = in_voxels(
             transform, place, shell.points[n, 0], shell.points[n, 1], shell.points[n, 2]
         )
-        session.asked[count] = key_of(np.int64(x), np.int64(y), np.int64(z), bits, curve)
+        request.asked[count] = key_of(np.int64(x), np.int64(y), np.int64(z), bits, curve)
         count += 1
-    session.n_asked = count
+    request.n_asked = count
 
 
 @leaf
@@ -85,11 +85,11 @@ def list_touching(grasp, n_hits):
 
 
 @leaf
-def note(ring, at, time, dt, lateness, elapsed, station):
-    """Record frame number `at` in its row of the ring buffer (capacity,) of FRAME."""
-    servo, spring = station.servo, station.springs[station.used_coupling]
+def note(ring, slot, time, dt, lateness, elapsed):
+    """Record the present frame in its row of the ring buffer (capacity,) of FRAME."""
+    servo, spring = slot.servo, slot.springs[slot.used_spring]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
-    row = ring[at % ring.shape[0]]
+    row = ring[slot.n_frames % ring.shape[0]]
     row.time = time
     row.dt = dt
     row.lateness = lateness
@@ -108,7 +108,7 @@ def note(ring, at, time, dt, lateness, elapsed, station):
     row.hits, row.contacts, row.deepest = sent.hits, sent.contacts, sent.deepest
     row.unknown = sent.unknown  # at the tried pose
     row.revision = sent.revision
-    row.buttons = station.reading.buttons
+    row.buttons = slot.reading.buttons
     state = CLUTCH_OPEN if hand.is_open else 0
     state |= HELD if sent.marks & IS_HELD else 0
     state |= FADING if sent.marks & IS_FADING else 0
@@ -118,26 +118,26 @@ def note(ring, at, time, dt, lateness, elapsed, station):
 
 
 @leaf
-def count(seat, servo, follower):
+def count(slot):
     """Add a frame to the session's counts."""
-    sent, hand = servo.sent, servo.hand
+    sent, hand, follower = slot.servo.sent, slot.servo.hand, slot.follower
     marks, wrench = sent.marks, sent.wrench
-    seat.peak_force = max(seat.peak_force, length_at(wrench, 0))
-    seat.peak_torque = max(seat.peak_torque, length_at(wrench, 3))
-    seat.hit_frames += sent.hits > 0
+    slot.peak_force = max(slot.peak_force, length_at(wrench, 0))
+    slot.peak_torque = max(slot.peak_torque, length_at(wrench, 3))
+    slot.hit_frames += sent.hits > 0
     if sent.contacts > 0:
-        seat.contact_frames += 1
-        seat.deepest = max(seat.deepest, sent.deepest)
-    seat.unknown_frames += sent.unknown > 0
-    seat.held_frames += (marks & IS_HELD) != 0
-    seat.stale_frames += hand.is_stale
-    seat.nowhere_frames += math.isnan(hand.position[0])
-    seat.ended_loose = (marks & IS_LOOSE) != 0
-    if seat.ended_loose and seat.loose_frames == 0:
-        seat.first_loose_frame = seat.n_frames
-    seat.loose_frames += seat.ended_loose
-    seat.guard_actions += (marks & IS_SOFTER) != 0
-    seat.least_share = follower.wanted_share if follower.wanted_share > 0.0 else 1.0
+        slot.contact_frames += 1
+        slot.deepest = max(slot.deepest, sent.deepest)
+    slot.unknown_frames += sent.unknown > 0
+    slot.held_frames += (marks & IS_HELD) != 0
+    slot.stale_frames += hand.is_stale
+    slot.nowhere_frames += math.isnan(hand.position[0])
+    slot.ended_loose = (marks & IS_LOOSE) != 0
+    if slot.ended_loose and slot.loose_frames == 0:
+        slot.first_loose_frame = slot.n_frames
+    slot.loose_frames += slot.ended_loose
+    slot.guard_actions += (marks & IS_SOFTER) != 0
+    slot.least_share = follower.wanted_share if follower.wanted_share > 0.0 else 1.0
 
 
 @leaf
@@ -147,16 +147,16 @@ def _bin_of(seconds):
 
 
 @leaf
-def count_times(seat, lateness, elapsed):
+def count_times(slot, lateness, elapsed):
     """Count a frame's lateness and computing time, seconds."""
-    seat.lateness[_bin_of(lateness)] += 1
-    seat.elapsed[_bin_of(elapsed)] += 1
-    seat.worst_lateness = max(seat.worst_lateness, lateness)
-    seat.worst_elapsed = max(seat.worst_elapsed, elapsed)
+    slot.lateness[_bin_of(lateness)] += 1
+    slot.elapsed[_bin_of(elapsed)] += 1
+    slot.worst_lateness = max(slot.worst_lateness, lateness)
+    slot.worst_elapsed = max(slot.worst_elapsed, elapsed)
 
 
 @leaf
-def show_contacts(seat, grasp, pose, spring):
+def show_contacts(slot, grasp, pose, spring):
     """Publish points, m, and forces, N, of at most MOST_SHOWN contacts in the slot, world frame."""
     follower, points, transform = grasp.follower, grasp.shell.points, transform_of(pose)
     near, n_near = grasp.near[follower.side], 0 if follower.is_loose else follower.n_near
@@ -165,7 +165,7 @@ def show_contacts(seat, grasp, pose, spring):
     for m in range(n_near):
         n_contacts += depth_of(grasp, near[m]) > 0.0
     every = max((n_contacts + MOST_SHOWN - 1) // MOST_SHOWN, 1)
-    seat.contacts_sequence += 1
+    slot.contacts_sequence += 1
     fence()
     n_met = n_shown = 0
     for m in range(n_near):
@@ -174,20 +174,20 @@ def show_contacts(seat, grasp, pose, spring):
             continue
         n_met += 1
         if (n_met - 1) % every == 0:
-            row, force = seat.contacts[n_shown], stiffness * depth
+            row, force = slot.contacts[n_shown], stiffness * depth
             row[0], row[1], row[2] = moved(transform, points[n, 0], points[n, 1], points[n, 2])
             for axis in range(3):
                 row[3 + axis] = force * near[m].along[axis]
             n_shown += 1
-    seat.n_contacts = n_shown
+    slot.n_contacts = n_shown
     fence()
-    seat.contacts_sequence += 1
+    slot.contacts_sequence += 1
 
 
 @leaf
-def show_objects(seat, session):
+def show_objects(slot, request):
     """Copy the ids of touched objects from the request queue to the slot."""
-    n_objects = min(session.n_objects, np.int64(MOST_ASKED))
+    n_objects = min(request.n_objects, np.int64(MOST_ASKED))
     for n in range(n_objects):
-        seat.objects[n] = session.objects[n]
-    seat.n_objects = n_objects
+        slot.objects[n] = request.objects[n]
+    slot.n_objects = n_objects

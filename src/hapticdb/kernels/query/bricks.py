@@ -34,7 +34,7 @@ from hapticdb.kernels.query.contact import (
 )
 from hapticdb.kernels.query.refining import NO_TALLY, feel_point, is_felt
 from hapticdb.kernels.query.sorting import insert_distinct, sorting_order
-from hapticdb.kernels.records import BRICK, GRID, MEASURED, OCCUPIED
+from hapticdb.kernels.records.rows import BRICK, GRID, MEASURED, OCCUPIED
 from hapticdb.kernels.resident.cells import spread_key
 from hapticdb.kernels.rigid import is_rigid, transform_of
 

@@ -19,7 +19,7 @@ from hapticdb.kernels._jit import (
 )
 from hapticdb.kernels.curves import Z_ORDER, compact, key_of, voxel_of, z_encode
 from hapticdb.kernels.query.sorting import sorting_order
-from hapticdb.kernels.records import GRID
+from hapticdb.kernels.records.rows import GRID
 from hapticdb.kernels.resident.cells import spread_key
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 

@@ -36,7 +36,7 @@ from hapticdb.kernels.law import (
 from hapticdb.kernels.query.contact import center_of, voxel_at
 from hapticdb.kernels.query.grouping import first_bound
 from hapticdb.kernels.query.sorting import insert_distinct
-from hapticdb.kernels.records import GRID
+from hapticdb.kernels.records.rows import GRID
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

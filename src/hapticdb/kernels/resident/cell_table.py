@@ -18,6 +18,7 @@ from hapticdb.kernels._jit import (
     WORDS32_2,
     entry,
     leaf,
+    record_of,
 )
 from hapticdb.kernels.curves import compact, decode, encode, voxel_of
 from hapticdb.kernels.field.lattice import (
@@ -26,12 +27,9 @@ from hapticdb.kernels.field.lattice import (
     cell_place,
     row_place,
 )
+from hapticdb.kernels.records.cells import BUFFERS, CONTROL, READER
 from hapticdb.kernels.resident.cells import (
-    BUFFERS,
     PLACE,
-    READER_STRIDE,
-    REVISION,
-    VERSION,
     Ints,
     brick_bit,
     cells_of_box,
@@ -222,23 +220,24 @@ def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
     return count, hand
 
 
-@entry(INTS, INT, INT)
-def publish(control, version, revision):
+@entry(record_of(CONTROL), INT, INT)
+def publish(control_record, version, revision):
     """Publish a version's directory, complete in its buffer: new frames read it from now on."""
-    control[REVISION + version % BUFFERS] = revision
+    control = control_record[()]
+    control.revisions[version % BUFFERS] = revision
     fence()
-    control[VERSION] = version
+    control.version = version
     fence()
 
 
-@entry(INTS)
+@entry(record_of(READER, 1))
 def oldest_version_read(readers):
     """Lowest version among frames in progress; the largest int64 without any."""
     fence()
     oldest = np.int64(0x7FFFFFFFFFFFFFFF)
-    for n in range(0, readers.shape[0], READER_STRIDE):
-        if readers[n] > 0:
-            oldest = min(oldest, readers[n])
+    for n in range(readers.shape[0]):
+        if readers[n].version > 0:
+            oldest = min(oldest, readers[n].version)
     return oldest
 
 

@@ -28,7 +28,6 @@ from hapticdb.kernels._jit import (
     FLOATS,
     FLOATS2,
     INT,
-    INTS,
     INTS2,
     INTS32_2,
     NONE,
@@ -37,8 +36,9 @@ from hapticdb.kernels._jit import (
     fields_of,
     inlined,
     leaf,
+    record_of,
 )
-from hapticdb.kernels.records import MOST_MISSED
+from hapticdb.kernels.records.cells import BUFFERS, CONTROL, MOST_MISSED, READER
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import moved
 
@@ -46,31 +46,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 CELL_WORDS = 1024
-BUFFERS = 3
 UNKNOWN = -1
 EMPTY_SLOT = 0
-VERSION = 0
-"""Index into `Cells.control` of the published version."""
-REVISION = 1
-"""First index into `Cells.control` of the database's revisions, one for each buffer."""
-CONTROL_WORDS = 16
-"""Length of `Cells.control`: two cache lines."""
-READER_STRIDE = 8
-"""Numbers from one reader to the next: a cache line, against false sharing."""
-FELT_REVISION = 1
-"""Index into a reader's numbers: the database's revision of the cells of its last frame."""
-LISTED = 0
-"""Index into a frame's list of unknown cells: their number, before their keys."""
 GROUP, BLOCK = 4, 64
 """Runs in a group and in a block, culled by one bounding sphere. Larger: culled less often."""
-WRENCH, HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 0, 6, 7, 8, 9, 10
-"""Indices into a frame's result (RESULTS,) float64."""
 
 
 class Cells(NamedTuple):
     """Cell table in shared memory, laid out by `hapticdb.resident.table.CellTable`.
 
-    control (CONTROL_WORDS,) int64; readers (R x 8,) int64 : version of each reader, 0 for none;
+    control () of CONTROL; readers (R,) of READER : read leases;
     keys (3, capacity) int64 and slots (3, capacity) int32 : directories; words (slots, 1024)
     uint32; masks (slots,) uint64; used (slots,) uint8 : set by frames at a read of the slot;
     payload (slots, 34^3) uint8 : stored distances, all BEYOND in slot 0; near (slots, 1024)
@@ -78,8 +63,8 @@ class Cells(NamedTuple):
     distances.
     """
 
-    control: Ints
-    readers: Ints
+    control: NDArray[np.void]
+    readers: NDArray[np.void]
     keys: NDArray[np.int64]
     slots: NDArray[np.int32]
     words: NDArray[np.uint32]
@@ -93,10 +78,9 @@ class Cells(NamedTuple):
         return self._replace(payload=None, near=None)
 
 
-CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, NONE, NONE)
-CELLS_WITH_DISTANCES = fields_of(
-    Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, BYTES2, WORDS32_2
-)
+_ALL = record_of(CONTROL), record_of(READER, 1), INTS2, INTS32_2, WORDS32_2, WORDS, BYTES
+CELLS = fields_of(Cells, *_ALL, NONE, NONE)
+CELLS_WITH_DISTANCES = fields_of(Cells, *_ALL, BYTES2, WORDS32_2)
 
 
 class Seen(NamedTuple):
@@ -248,14 +232,14 @@ def seen_in(cells, which, words):
 @leaf
 def begin_frame(cells, reader):
     """Announce a frame of a reader; return its directory, valid until `end_frame`."""
-    control, readers = cells.control, cells.readers
+    control, lease = cells.control[()], cells.readers[reader]
     while True:
-        version = control[VERSION]
-        readers[reader * READER_STRIDE] = version
+        version = control.version
+        lease.version = version
         fence()
-        if control[VERSION] == version:
+        if control.version == version:
             which = version % BUFFERS
-            readers[reader * READER_STRIDE + FELT_REVISION] = control[REVISION + which]
+            lease.revision = control.revisions[which]
             return which
 
 
@@ -263,17 +247,17 @@ def begin_frame(cells, reader):
 def end_frame(cells, reader):
     """End the frame that `begin_frame` announced; its directory may be reused."""
     fence()
-    cells.readers[reader * READER_STRIDE] = 0
+    cells.readers[reader].version = 0
 
 
 @inlined
 def with_missed(missed, count, key):
-    """Add an unknown cell to the list, unless present or the list is full; return its length."""
-    for n in range(1, count + 1):
-        if missed[n] == key:
+    """Add an unknown cell to a MISSED, unless present or the list is full; return its length."""
+    for n in range(count):
+        if missed.cells[n] == key:
             return count
     if count < MOST_MISSED:
-        missed[count + 1] = key
+        missed.cells[count] = key
         return count + 1
     return count
 

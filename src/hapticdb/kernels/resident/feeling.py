@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from hapticdb.kernels._jit import (
-    FLOATS2,
     FLOATS3,
     INT,
     INTS,
@@ -21,6 +20,7 @@ from hapticdb.kernels._jit import (
     entry,
     inlined,
     leaf,
+    record_of,
 )
 from hapticdb.kernels.field.corners import fetch_corners, interpolated
 from hapticdb.kernels.field.lattice import CELL_VALUES, VOXELS_A_STEP, cell_place, place_before
@@ -44,18 +44,15 @@ from hapticdb.kernels.law import (
     sample_slot,
     share_slot,
 )
+from hapticdb.kernels.records.cells import MISSED
+from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident.cells import (
     CELL_WORDS,
     CELLS,
     CELLS_WITH_DISTANCES,
     CLUSTERS,
-    CONTACTS,
-    DEEPEST,
-    HITS,
-    LISTED,
     PLACE,
     UNKNOWN,
-    UNKNOWNS,
     begin_frame,
     bit_in,
     brick_bit,
@@ -269,11 +266,11 @@ _weigh = chosen_by_type(lambda law: OF_LAWS.get(law, OF_OTHERS)[1])
 
 @leaf
 def felt(law, cells, which, shell, pose, place, met, missed, out):
-    """One frame: hits of a placed shell and the wrench of its contacts, into out (RESULTS,).
+    """One frame: hits of a placed shell and the wrench of its contacts, into `out`, a RESULT.
 
-    met (N,) : indices of the hits; missed (1 + MOST_MISSED,) : number and keys of the unknown cells
-    with points. A point in an unknown cell is neither a hit nor a miss. Arithmetic and order of the
-    sums are those of `contact.locate` and `refining.refine`.
+    met (N,) : indices of the hits; missed : a MISSED, the unknown cells with points. A point in an
+    unknown cell is neither a hit nor a miss. Arithmetic and order of the sums are those of
+    `contact.locate` and `refining.refine`.
     """
     points, scratch, words, n_runs = shell.points, scratch_of(shell), cells.words, n_runs_of(shell)
     felt_in, margin, anyway = felt_where(law, words, cells.near)
@@ -314,18 +311,19 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
                 scratch.nx[at], scratch.ny[at], scratch.nz[at],
             )  # fmt: skip
             sums = accumulate(sums, point, center, depth, law.stiffness)
-    average_into(out, weight, sums)
-    out[HITS], out[CONTACTS] = n_hits, n_contacts
-    out[UNKNOWNS], out[DEEPEST] = n_unknown, deepest
-    missed[LISTED] = n_missed
+    average_into(out.wrench, weight, sums)
+    out.hits, out.contacts = n_hits, n_contacts
+    out.unknown, out.deepest = n_unknown, deepest
+    missed.n_cells = n_missed
 
 
 @entry(
-    CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2,
+    CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, record_of(MISSED),
+    record_of(RESULT, 1),
     also={CELLS: CELLS_WITH_DISTANCES, TANGENT_PLANE: DISTANCE_FIELD},
 )  # fmt: skip
-def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
-    """`felt` at poses (M, 4, 4) into out (M, RESULTS); `met`, `missed` : of the last frame.
+def feel_kernel(cells, reader, shell, poses, place, law, met, missed_record, out):
+    """`felt` at poses (M, 4, 4) into out (M,) of RESULT; `met`, `missed` : of the last frame.
 
     Returns the number of poses done: fewer than M when one is not rigid.
     """
@@ -333,6 +331,6 @@ def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
         if not is_rigid(poses[n]):
             return n
         which = begin_frame(cells, reader)
-        felt(law, cells, which, shell, poses[n], place, met, missed, out[n])
+        felt(law, cells, which, shell, poses[n], place, met, missed_record[()], out[n])
         end_frame(cells, reader)
     return poses.shape[0]

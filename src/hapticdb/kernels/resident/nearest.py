@@ -14,7 +14,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS3, INT, INTS, entry, inlined, leaf, record_of
 from hapticdb.kernels.bits import highest_bit, lowest_bit
-from hapticdb.kernels.records import NEAR_CUBE
+from hapticdb.kernels.records.rows import NEAR_CUBE
 from hapticdb.kernels.resident.cells import (
     CELLS,
     CLUSTERS,

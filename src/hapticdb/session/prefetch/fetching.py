@@ -14,15 +14,9 @@ import numpy as np
 
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.kernels.records import TOLD
+from hapticdb.kernels.records.cells import PREFETCH_REQUEST
 from hapticdb.resident.residency import BATCH, Loaded, Residency
-from hapticdb.resident.table import (
-    FIRST_VERSION,
-    HEARTBEAT,
-    LOST,
-    STOP,
-    CellTable,
-)
+from hapticdb.resident.table import FIRST_VERSION, CellTable
 from hapticdb.session.prefetch.tracking import ObjectAnswers, PrefetchRequest, SessionTracker
 from hapticdb.session.processes.process import MessageSender, parent_is_gone
 from hapticdb.store.base import NO_KEYS, Store
@@ -142,9 +136,9 @@ class Fetcher:
     def warm_up(self) -> None:
         """Run all steps of a round once, on one cell, so no later round compiles a kernel."""
         grid = self.request.grid
-        told = np.zeros((), TOLD)
+        told = np.zeros((), PREFETCH_REQUEST)
         told["tool"] = told["handle"] = grid.origin
-        request = PrefetchRequest.of_told(grid, told, LOOKAHEAD, 0.0)
+        request = PrefetchRequest.of_record(grid, told, LOOKAHEAD, 0.0)
         assert request is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(request.cells(grid)[0][:1]))
         self.residency.warm_up()
@@ -182,8 +176,8 @@ class Fetcher:
         control = self.table.cells.control
         if self._is_confirmed:
             self._confirmed_at = self._now
-            control[LOST] = 0
-            control[HEARTBEAT] = begun
+            control["is_lost"] = 0
+            control["heartbeat"] = begun
 
     def _note_lag(self) -> None:
         """Write to the request queue how far a standby is behind."""
@@ -263,7 +257,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
     fetcher: Fetcher | None = None
     patience, at_most = RETRY
     is_lost = is_ready = False
-    while not table.cells.control[STOP] and not parent_is_gone():
+    while not table.cells.control["is_over"] and not parent_is_gone():
         try:
             if fetcher is None:
                 fetcher = Fetcher(request)
@@ -287,7 +281,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
                 raise
             if not is_lost:
                 sender.send("lost", str(error))  # first, so that who sees the mark finds the cause
-                table.cells.control[LOST] = 1
+                table.cells.control["is_lost"] = 1
                 if fetcher is not None:
                     table.queue.figures["losses"] += 1
             is_lost = True

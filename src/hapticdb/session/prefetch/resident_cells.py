@@ -11,12 +11,12 @@ from typing import NamedTuple
 from hapticdb.closing import Closes
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.kernels.records import FIGURES
+from hapticdb.kernels.records.cells import FIGURES
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
 from hapticdb.recording.header import Header, Start
 from hapticdb.resident.residency import check_cells, check_distances
-from hapticdb.resident.table import DEFAULT_BUDGET, HEARTBEAT, LOST, STOP, CellTable
+from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
 from hapticdb.session.coupling import DirectRendering, SettledCoupling
 from hapticdb.session.prefetch.fetching import FetchRequest, Wrap
 from hapticdb.session.processes.fork_server import prepare
@@ -195,9 +195,9 @@ class ResidentCells(Closes):
     def database_lost(self) -> str | None:
         """One line: why the database cannot be read now; None while it can. As of `supervise`."""
         control = self.table.cells.control
-        if control[LOST]:
+        if control["is_lost"]:
             return self._lost_by or f"{redact(self.url)} does not answer"
-        if time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS:
+        if time.monotonic_ns() - int(control["heartbeat"]) > SILENCE_NS:
             return f"{redact(self.url)} has not answered for {1e-9 * SILENCE_NS:g} s"
         return None
 
@@ -212,7 +212,7 @@ class ResidentCells(Closes):
             If the cells have distances and an object was written that has none.
         """
         with self._supervising:
-            if self.table.cells.control[STOP]:
+            if self.table.cells.control["is_over"]:
                 return
             is_alive = self._process.is_alive  # read first: its last message may come with its end
             self._take_messages()
@@ -275,7 +275,7 @@ class ResidentCells(Closes):
         """End the prefetch process and free the memory; does nothing in a forked copy."""
         if os.getpid() != self._pid:
             return
-        self.table.cells.control[STOP] = 1
+        self.table.cells.control["is_over"] = 1
         with self._supervising:
             self._process.end(END_PATIENCE)
             self.table.close()

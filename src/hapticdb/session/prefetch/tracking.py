@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import CELL_BITS, Grid
 from hapticdb.kernels.field.law import ONSET
-from hapticdb.kernels.records import MOST_ASKED
+from hapticdb.kernels.records.cells import MOST_ASKED
 from hapticdb.kernels.resident.cell_table import cells_ahead
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
 from hapticdb.resident.residency import Residency
@@ -61,14 +61,14 @@ class PrefetchRequest(NamedTuple):
     margin: float
 
     @classmethod
-    def of_told(
+    def of_record(
         cls, grid: Grid, told: NDArray[np.void], lookahead: float, peak_speed: float
     ) -> "PrefetchRequest | None":
         """Request of a session; None unless all numbers of its tool are finite.
 
-        told () : of `kernels.records.TOLD`. The bounding sphere moves from the tool to the hand,
-        and on with the hand's velocity for `lookahead` seconds. The margin is the greatest distance
-        of the hand from this path after this time, at 1.5 times its recent `peak_speed` (m/s), at
+        told () : of `PREFETCH_REQUEST`. The bounding sphere moves from the tool to the hand, and on
+        with the hand's velocity for `lookahead` seconds. The margin is the greatest distance of the
+        hand from this path after this time, at 1.5 times its recent `peak_speed` (m/s), at
         `REACH_VOXELS` at least.
         """
         tool, handle, velocity = told["tool"], told["handle"], told["velocity"]
@@ -171,8 +171,8 @@ class SessionTracker:
 
         elapsed : seconds since the last call; lookahead : look-ahead time, s.
         """
-        queue = self._table.queue.sessions
-        active = set(np.flatnonzero(queue["told"]["is_active"]).tolist())
+        queue = self._table.queue.requests
+        active = set(np.flatnonzero(queue["prefetch"]["is_active"]).tolist())
         has_moved = active != set(self.sessions)
         self.sessions = {row: self.sessions.get(row, _TrackedSession()) for row in sorted(active)}
         for row, session in self.sessions.items():
@@ -182,7 +182,7 @@ class SessionTracker:
             speed = float(np.linalg.norm(told["velocity"]))
             if np.isfinite(speed):
                 session.speed = max(speed, session.speed * 0.5 ** (elapsed / SPEED_HALF_LIFE))
-            request = PrefetchRequest.of_told(self._grid, told, lookahead, session.speed)
+            request = PrefetchRequest.of_record(self._grid, told, lookahead, session.speed)
             if request is None or (
                 session.request is not None and request.is_near(session.request)
             ):
@@ -194,17 +194,17 @@ class SessionTracker:
 
     def _read_told(self, row: int, session: _TrackedSession) -> NDArray[np.void] | None:
         """Read a row of the queue completely; None if its loop died while it wrote the row."""
-        queue = self._table.queue.sessions
+        queue = self._table.queue.requests
         for _ in range(READ_ATTEMPTS):
             session.sequence = int(queue["sequence"][row])
-            told: NDArray[np.void] = queue["told"][row, ...].copy()
+            told: NDArray[np.void] = queue["prefetch"][row, ...].copy()
             if session.sequence % 2 == 0 and session.sequence == queue["sequence"][row]:
                 return told
         return None
 
     def has_met_unknown_cells(self) -> bool:
         """Whether any session's last frame had unknown cells."""
-        return bool(self._table.queue.sessions["n_missed"][list(self.sessions)].any())
+        return bool(self._table.queue.requests["missed"]["n_cells"][list(self.sessions)].any())
 
     def urgent_cells(self) -> Keys:
         """Cells of all sessions, distinct, most urgent first."""
@@ -230,15 +230,15 @@ class SessionTracker:
         table.queue.figures["wanted"] += len(cells)
         table.queue.figures["granted"] += len(cells) - len(unknown)
         session.n_missing = len(unknown)
-        n_missed = int(table.queue.sessions["n_missed"][row])
-        if n_missed:
-            missed = np.unique(table.queue.sessions["missed"][row, :n_missed])
+        unknowns = table.queue.requests["missed"][row]
+        if n_missed := int(unknowns["n_cells"]):
+            missed = np.unique(unknowns["cells"][:n_missed])
             session.n_missing += int(np.count_nonzero(residency.slots_of(missed) == UNKNOWN))
             yield missed, np.full(len(missed), MET)
 
     def report_missing(self) -> None:
         """Report the number of missing cells to each session, with the number of its request."""
-        queue = self._table.queue.sessions
+        queue = self._table.queue.requests
         for row, session in self.sessions.items():
             queue["n_missing"][row] = session.n_missing
             queue["heard"][row] = session.sequence
@@ -270,7 +270,7 @@ class ObjectAnswers:
     """
 
     def __init__(self, table: CellTable, residency: Residency) -> None:
-        self._queue = table.queue.sessions
+        self._queue = table.queue.requests
         self._residency = residency
         self._has_distances = table.has_distances
         self._answered: dict[int, bytes] = {}

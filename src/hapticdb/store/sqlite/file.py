@@ -18,7 +18,7 @@ from hapticdb.errors import (
     NotAnEnvironmentError,
     ReadOnlyError,
 )
-from hapticdb.kernels.records import DECODED_BYTES
+from hapticdb.kernels.records.rows import DECODED_BYTES
 from hapticdb.store.refusals import check_format, made_before
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.place import OpenedFile

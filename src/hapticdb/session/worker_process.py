@@ -1,6 +1,7 @@
 """Worker processes in their parent: of one session with a device, or of many."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from hapticdb.query.law import ForceLaw
 from hapticdb.session.coupling import Rendering
 from hapticdb.session.processes.process import Process
-from hapticdb.session.shared_table import TAKEN, SharedTable
+from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest
 
@@ -23,11 +24,11 @@ FILLED = 8
 class WorkerProcess(Process):
     """A worker process, in its parent.
 
-    number : of the worker, from 0; request : its sessions; ready : content of its first message.
+    request : its sessions; ready : content of its first message.
     """
 
-    def __init__(self, number: int, request: WorkerRequest) -> None:
-        self.number, self.request = number, request
+    def __init__(self, request: WorkerRequest) -> None:
+        self.request = request
         descriptors = [request.shared.descriptor]
         if request.alone is not None:
             descriptors.append(request.alone.table.descriptor)
@@ -46,7 +47,7 @@ class Workers:
     def __init__(self, shared: SharedTable, rate: float, most: int) -> None:
         self._shared, self._timing, self._most = shared, Timing(rate), most
         self._processes: list[WorkerProcess] = []
-        self._next = 0
+        self._next = 1
 
     @property
     def pids(self) -> list[int]:
@@ -59,14 +60,17 @@ class Workers:
             self._processes.remove(process)
             process.end()
         slots = self._shared.slots
-        request = WorkerRequest(self._shared, self._timing, law, rendering)
-        alike = [process for process in self._processes if process.request == request]
+        request = WorkerRequest(self._shared, self._timing, law, rendering, number=self._next)
+        alike = [
+            process
+            for process in self._processes
+            if replace(process.request, number=self._next) == request
+        ]
         counts = [
-            int(np.count_nonzero((slots["state"] == TAKEN) & (slots["worker"] == process.number)))
-            for process in alike
+            int(np.count_nonzero(slots["worker"] == process.request.number)) for process in alike
         ]
         if not counts or (min(counts) >= FILLED and len(self._processes) < self._most):
-            self._processes.append(WorkerProcess(self._next, request))
+            self._processes.append(WorkerProcess(request))
             self._next += 1
             return self._processes[-1]
         return alike[int(np.argmin(counts))]

@@ -7,7 +7,7 @@ import pytest
 
 from hapticdb.cli import session_page
 
-AWAY = SimpleNamespace(is_lost=True, url="gone.db", first_objects=())
+AWAY = SimpleNamespace(database_lost="gone", url="gone.db", first_objects=())
 """Cells whose database does not answer: ids stand in place of names."""
 
 

@@ -231,7 +231,7 @@ def _names_after(cells: "ResidentCells", ids: Sequence[int]) -> str:
 
     names = {obj.id: obj.name for obj in cells.first_objects}
     with suppress(DatabaseError):
-        if not set(ids) <= set(names) and not cells.is_lost:
+        if not set(ids) <= set(names) and cells.database_lost is None:
             with hapticdb.open(cells.url, read_only=True) as env:
                 names = {obj.id: obj.name for obj in env.objects()}
     listed = [names.get(i, f"object {i}") for i in ids]

@@ -128,7 +128,13 @@ class Coupling:
         scale: float,
         radius: float,
     ) -> "DirectRendering":
-        """Coupling or, rendered directly, caps of one session; parameters as of `settled`."""
+        """Coupling of one session or, rendered directly, its caps; with all numbers.
+
+        profile : the device's own, unless `self.profile` takes its place; rate : frames a second;
+        scale : S, metres of the scene for one metre of the device; radius : distance of the tool's
+        farthest point from its centre, metres of the scene. Raises `UsageError` if stiffness or
+        delay cannot be used, or a number is given that only a spring has.
+        """
         if rendering == "direct":
             return self.direct(profile, scale, radius)
         return self.settled(profile, rate, scale, radius)
@@ -136,24 +142,7 @@ class Coupling:
     def settled(
         self, profile: DeviceProfile, rate: float, scale: float, radius: float
     ) -> "SettledCoupling":
-        """Coupling of one session, with all its numbers.
-
-        Parameters
-        ----------
-        profile : DeviceProfile
-            The device's own; `self.profile` takes its place if it is given.
-        rate : float
-            Frames a second.
-        scale : float
-            S, metres of the scene for one metre of the device.
-        radius : float
-            Distance of the tool's farthest point from its centre, metres of the scene.
-
-        Raises
-        ------
-        UsageError
-            If the stiffness or the delay cannot be used.
-        """
+        """Coupling of one session, as of `of_session`."""
         profile = self.profile or profile
         allowed = allow(profile, rate, self.stiffness, self.delay)
         stiffness, lever = allowed.stiffness, radius / scale
@@ -176,13 +165,7 @@ class Coupling:
         )
 
     def direct(self, profile: DeviceProfile, scale: float, radius: float) -> "DirectRendering":
-        """Rendering without a coupling; the parameters are those of `settled`.
-
-        Raises
-        ------
-        UsageError
-            If a number is given that only a spring has.
-        """
+        """Rendering without a coupling, as of `of_session`."""
         for name in ("stiffness", "turn_stiffness", "damping", "delay"):
             if getattr(self, name) is not None:
                 raise UsageError(

@@ -6,7 +6,6 @@ import socket
 import threading
 from contextlib import ExitStack, suppress
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,21 +18,22 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import row_of_pose
-from hapticdb.query.law import DISTANCE, PLANE
+from hapticdb.query.law import DISTANCE, PLANE, ForceLaw
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.session.attached import serve_attached
 from hapticdb.session.coupling import Coupling, Rendering, radius_of, rendering_of
 from hapticdb.session.hosted import HostedSession, Recorded
 from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
-from hapticdb.session.prefetch.tables import SharedTables
 from hapticdb.session.running import Running
 from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.supervisor import Supervisor
 from hapticdb.session.timing import Timing
-from hapticdb.session.workers import Workers
+from hapticdb.session.worker import WorkerProcess, WorkerRequest
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 
+FILLED = 8
+"""Sessions of a worker before another one is started, up to the host's most."""
 MOST_SESSIONS = 64
 """Most sessions of a host. Larger: more shared memory, 960 kB each."""
 
@@ -67,11 +67,12 @@ class SessionHost(Closes):
         if processes is not None and processes < 1:
             raise UsageError(f"{processes} worker processes: give 1 or more")
         self.url, self.rate, self._rendering = url, rate, rendering
-        self._tables = SharedTables(url, budget_bytes)
+        self._budget_bytes, self._most = budget_bytes, processes or os.cpu_count() or 1
+        self._tables: dict[Filter, ResidentCells] = {}
+        self._workers: list[WorkerProcess] = []
         self._shared = SharedTable.create(MOST_SESSIONS)
-        self._workers = Workers(self._shared, rate, processes or os.cpu_count() or 1)
-        self._supervisor = Supervisor(self._shared, self._tables.all)
-        self._ids = itertools.count(1)
+        self._supervisor = Supervisor(self._shared, lambda: self.cells)
+        self._ids, self._numbers = itertools.count(1), itertools.count(1)
         self._changing = threading.RLock()
         self._served: list[socket.socket] = []
         self._is_closed = False
@@ -109,24 +110,11 @@ class SessionHost(Closes):
             raise UsageError("a session starts at a pose (4, 4) that is a rigid transform")
         Handle(scale=scale)  # checks it
         felt = Filter(where, exclude)
-        with self._changing:
+        with self._changing, ExitStack() as undo:
             if self._is_closed:
                 raise UsageError("the host is closed: make another")
-            return self._begin(shell, pose, felt, coupling, scale)
-
-    def _begin(
-        self,
-        shell: PointShell,
-        pose: Any,  # noqa: ANN401 - (4, 4), checked
-        felt: Filter,
-        coupling: Coupling | None,
-        scale: float,
-    ) -> HostedSession:
-        """Take slot, cells and worker for a session; all are given back if one is not to be had."""
-        number = next(self._ids)
-        with ExitStack() as undo:
-            cells = self._tables.take(felt)
-            undo.callback(self._tables.release, cells)
+            undo.callback(self._free_tables)
+            cells = self._cells_of(felt)
             law = DISTANCE if cells.has_distances else PLANE
             if self._rendering == "coupled" and law is PLANE:
                 raise UsageError(without_distances(self.url, "leave out --rendering coupled"))
@@ -134,7 +122,7 @@ class SessionHost(Closes):
             settled = (coupling or Coupling()).of_session(
                 rendering, SCRIPTED, self.rate, scale, radius_of(shell, cells.grid.voxel_size)
             )
-            worker = self._workers.least_busy(law, rendering)
+            worker, number = self._least_busy(law, rendering), next(self._ids)
             running = Running(number, self._shared, cells, shell, settled)
             undo.callback(running.close)
             running.worker = worker
@@ -149,6 +137,40 @@ class SessionHost(Closes):
             self._supervisor.sessions[number] = running
             undo.pop_all()
         return HostedSession(self._shared, running.slot, number, self._call)
+
+    def _cells_of(self, felt: Filter) -> ResidentCells:
+        """Table of a filter's objects, made when first needed."""
+        if felt not in self._tables:
+            self._tables[felt] = ResidentCells(
+                self.url, budget_bytes=self._budget_bytes, where=felt.where, exclude=felt.exclude
+            )
+        return self._tables[felt]
+
+    def _free_tables(self) -> None:
+        """Free the tables that no session uses."""
+        used = [running.cells for running in self._supervisor.sessions.values()]
+        for felt, cells in list(self._tables.items()):
+            if cells not in used:
+                del self._tables[felt]
+                cells.close()
+
+    def _least_busy(self, law: ForceLaw, rendering: Rendering) -> WorkerProcess:
+        """Worker for one more such session: with the fewest, or a new one if all are filled."""
+        for worker in [worker for worker in self._workers if not worker.is_alive]:
+            self._workers.remove(worker)
+            worker.end()
+        counts = {
+            worker: int(np.count_nonzero(self._shared.slots["worker"] == worker.request.number))
+            for worker in self._workers
+            if (worker.request.law, worker.request.rendering) == (law, rendering)
+        }
+        least = min(counts.values(), default=FILLED)
+        if not counts or (least >= FILLED and len(self._workers) < self._most):
+            self._workers.append(WorkerProcess(WorkerRequest(
+                self._shared, Timing(self.rate), law, rendering, number=next(self._numbers)
+            )))  # fmt: skip
+            return self._workers[-1]
+        return min(counts, key=counts.__getitem__)
 
     def sessions(self) -> list[HostedSession]:
         """Sessions now, by their ids."""
@@ -172,7 +194,7 @@ class SessionHost(Closes):
         try:
             return running.end()
         finally:
-            self._tables.release(running.cells)
+            self._free_tables()
 
     def serve(self, sock: socket.socket) -> None:
         """Serve an `AttachedHost` in a thread; the host owns the socket from now on."""
@@ -187,12 +209,12 @@ class SessionHost(Closes):
     @property
     def cells(self) -> list[ResidentCells]:
         """Tables of cells in use, one for each filter, with their figures."""
-        return self._tables.all()
+        return list(self._tables.values())
 
     @property
     def pids(self) -> list[int]:
         """Process ids of the workers."""
-        return self._workers.pids
+        return [worker.pid for worker in self._workers if worker.is_alive]
 
     def close(self) -> None:
         """End all sessions, processes and recordings; a second call does nothing."""
@@ -200,8 +222,10 @@ class SessionHost(Closes):
             return
         self._is_closed = True
         with self._changing, ExitStack() as ends:
-            ends.callback(self._tables.close)
-            ends.callback(self._workers.close)
+            for cells in self.cells:
+                ends.callback(cells.close)
+            for worker in self._workers:
+                ends.callback(worker.end)
             for sock in self._served:
                 ends.callback(_shut, sock)
             ends.callback(self._supervisor.close)

@@ -16,7 +16,7 @@ from hapticdb.session.hosted import Recorded
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.states import SlotRequest
-from hapticdb.session.workers import WorkerProcess
+from hapticdb.session.worker import WorkerProcess
 
 END_PATIENCE = 5.0
 """Seconds until the loop must have left an ending session; normally one period."""

@@ -25,8 +25,7 @@ from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.states import FOREVER
 from hapticdb.session.supervisor import LOOK_EVERY, Supervisor
 from hapticdb.session.timing import Timing
-from hapticdb.session.worker import WorkerRequest
-from hapticdb.session.workers import WorkerProcess
+from hapticdb.session.worker import WorkerProcess, WorkerRequest
 
 if TYPE_CHECKING:
     from hapticdb.batches.feeler import BatchDevice

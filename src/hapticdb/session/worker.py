@@ -9,8 +9,9 @@ device.
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +25,18 @@ from hapticdb.session.processes.channel import Message
 from hapticdb.session.processes.process import (
     LOOK_EVERY,
     MessageSender,
+    Process,
     parent_is_gone,
     reply_to_parent,
 )
 from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.states import LEAVE_PATIENCE, PeriodClock, SessionState, SlotRequest
 from hapticdb.session.timing import Timing, undisturbed
+
+WORK = "hapticdb.session.worker:work"
+"""Function of a worker process."""
+ANSWER_PATIENCE = 30.0
+"""Seconds for the answer to a command; normally milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +53,26 @@ class WorkerRequest:
     rendering: Rendering
     alone: DeviceRequest | None = None
     number: int = 1
+
+
+class WorkerProcess(Process):
+    """A worker process, in its parent.
+
+    request : its sessions; ready : content of its first message.
+    """
+
+    def __init__(self, request: WorkerRequest) -> None:
+        self.request = request
+        descriptors = [request.shared.descriptor]
+        if request.alone is not None:
+            descriptors.append(request.alone.table.descriptor)
+        super().__init__(WORK, request, descriptors, with_kernels=True)
+        self.ready = self.await_ready("worker")
+        self._channel.sock.settimeout(ANSWER_PATIENCE)
+
+    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
+        """Send a command and wait for its answer; see `Channel.ask`."""
+        return self._channel.ask(word, *content, descriptors=descriptors)
 
 
 class Worker:

@@ -19,8 +19,10 @@ from hapticdb.recording.file import Recorder
 from hapticdb.session.attached import serve_attached
 from hapticdb.session.host import SessionHost
 from hapticdb.session.hosted import HostedSession
+from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.processes.channel import Channel
 from hapticdb.session.shared_table import SharedTable
+from hapticdb.store.filtering import Filter
 from session.hands import at
 
 ABOVE = at(0.0, 0.0, 0.02)
@@ -140,13 +142,12 @@ def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     is_slow, may_go_on = threading.Event(), threading.Event()
-    take = host._tables.take
+    cells_of = host._cells_of
 
-    def wait(felt: object) -> object:
-        with host._tables._making:  # held while a table's process starts
-            is_slow.set()
-            assert may_go_on.wait(PATIENCE)
-        return take(felt)  # type: ignore[arg-type]
+    def wait(felt: Filter) -> ResidentCells:
+        is_slow.set()
+        assert may_go_on.wait(PATIENCE)
+        return cells_of(felt)
 
     session.record(tmp_path / "slow.hdbrec")
 
@@ -154,7 +155,7 @@ def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
         host.begin(sphere, ABOVE).end()  # in another worker, since the first has died by then
 
     with monkeypatch.context() as patch:
-        patch.setattr(host._tables, "take", wait)
+        patch.setattr(host, "_cells_of", wait)
         thread = threading.Thread(target=begin)
         thread.start()
         try:

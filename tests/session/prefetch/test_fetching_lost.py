@@ -70,9 +70,9 @@ def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
     side = served(cells, sphere, pose)
     naive = touch_of_shell(ids_by_voxel(env), env.grid, sphere, pose)
     Path(env.url).rename(tmp_path / "elsewhere")
-    until(lambda: cells.is_lost)
+    until(lambda: cells.database_lost)
     (tmp_path / "elsewhere").rename(env.url)
-    until(lambda: not cells.is_lost)
+    until(lambda: not cells.database_lost)
     until(lambda: side.reader.feel(pose)[0] == naive.hits)
     assert (cells.figures().losses, cells.restarts) == (1, 0)
 

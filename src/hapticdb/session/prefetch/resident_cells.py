@@ -187,11 +187,6 @@ class ResidentCells(Closes):
         return self._process.pid
 
     @property
-    def is_lost(self) -> bool:
-        """Whether the database does not answer now."""
-        return self.database_lost is not None
-
-    @property
     def database_lost(self) -> str | None:
         """One line: why the database cannot be read now; None while it can. As of `supervise`."""
         control = self.table.cells.control

@@ -120,7 +120,9 @@ def test_a_moved_object_is_as_if_imported_there(
         hapticdb.open(tmp_path / "there" / "e.db", read_only=True) as fresh,
     ):
         before, old = index_rows(env), env.object(1)
-        moved = env.move(1, ELSEWHERE)
+        with pytest.raises(hapticdb.errors.UsageError, match=r"'ball \*' selects 2 objects"):
+            env.move("ball *", ELSEWHERE)
+        moved = env.move("ball 0", ELSEWHERE)
         assert index_rows(env) == index_rows(fresh) != before
         wanted = fresh.object(1)
         assert (moved.id, moved.name, moved.digest) == (1, "ball 0", wanted.digest)

@@ -11,7 +11,15 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, UsageError
-from hapticdb.poses import quaternion_of, read_poses, read_timed_poses, rotation_of, write_poses
+from hapticdb.poses import (
+    Order,
+    pose_of_row,
+    quaternion_of,
+    read_poses,
+    read_timed_poses,
+    rotation_of,
+    write_poses,
+)
 
 HEADER = "x,y,z,qw,qx,qy,qz\n"
 
@@ -150,6 +158,51 @@ def test_times_that_cannot_be_are_told_only_where_times_are_asked_for(
         read_timed_poses(path)
     assert "\n" not in str(caught.value)
     assert np.isfinite(read_poses(path)).all()
+
+
+TURN = [0.0, 0.6, 0.0, 0.8]
+"""Quaternion qx, qy, qz, qw of a pose at 1, 2, 3."""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "order"),
+    [
+        ("tum.txt", "# timestamp tx ty tz qx qy qz qw\n0.5 1 2 3 0 0.6 0 0.8\n", None),
+        ("tum.tsv", "0.5\t1\t2\t3\t0\t0.6\t0\t0.8\n", None),
+        ("ompl.txt", "1 2 3 0 0.6 0 0.8 \n\n", None),
+        ("scalar.txt", "1 2 3 0.8 0 0.6 0\n", "wxyz"),
+        ("bare.csv", "1,2,3,0,0.6,0,0.8\n", "xyzw"),
+        ("wrong.csv", HEADER + "1,2,3,0,0.6,0,0.8\n", "xyzw"),
+        ("named.txt", "qx qy qz qw x y z\n0 0.6 0 0.8 1 2 3\n", None),
+    ],
+)
+def test_paths_of_other_programs_are_read(
+    tmp_path: Path, name: str, text: str, order: Order | None
+) -> None:
+    (tmp_path / name).write_text(text)
+    expected = pose_of_row([1.0, 2.0, 3.0], np.roll(TURN, 1))
+    assert np.allclose(read_poses(tmp_path / name, order=order), expected, atol=1e-15)
+
+
+def test_arrays_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "poses.npy"
+    expected = np.stack([np.eye(4), pose_of_row([1.0, 2.0, 3.0], np.roll(TURN, 1))])
+    np.save(path, expected)
+    assert read_poses(path).tobytes() == expected.tobytes()
+    assert read_poses(path, unit="mm")[1, :3, 3].tolist() == [1e-3, 2e-3, 3e-3]
+    np.save(path, [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [1.0, 2.0, 3.0, 0.8, 0.0, 0.6, 0.0]])
+    assert np.allclose(read_poses(path), expected, atol=1e-15)
+    np.save(path, [[1, 2, 3, *TURN]])
+    assert np.allclose(read_poses(path, order="xyzw"), expected[1:], atol=1e-15)
+    for wrong, said in (
+        (np.eye(4), "the shape"), (np.zeros((0, 7)), "no pose"),
+        (np.zeros((1, 7)), "pose 0: the quaternion"), (np.array(["a"]), "<U1"),
+    ):  # fmt: skip
+        np.save(path, wrong)
+        with pytest.raises((FileError, UsageError), match=said):
+            read_poses(path)
+    with pytest.raises(UsageError, match="wxyz or xyzw"):
+        read_poses(path, order="zyxw")  # type: ignore[arg-type]
 
 
 UPRIGHT, TURNED = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.6, 0.8)

@@ -1,8 +1,11 @@
-"""Files of poses: a line for each pose, position in metres and unit quaternion, scalar first.
+"""Files of poses: a line for each pose, position in metres and unit quaternion.
 
 The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order. Other columns are ignored, except
-``t``, seconds, for `read_timed_poses`. Quaternions are normalised; ``q`` and ``-q`` are the same
-pose. A warning is issued if the columns seem to be in another order than their names.
+``t``, seconds, for `read_timed_poses`. Lines of numbers between blanks need no header: 8 as of TUM,
+``t x y z qx qy qz qw``, or 7, without t, as of OMPL's `printAsMatrix`; ``#`` begins a comment. A
+.npy file has an array (M, 4, 4), or (M, 7) with the scalar first. Quaternions are normalised; ``q``
+and ``-q`` are the same pose. A warning is issued if the columns seem to be in another order than
+their names.
 """
 
 import codecs
@@ -10,8 +13,11 @@ import csv
 import io
 import math
 import os
+import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +33,9 @@ FARTHEST = 1e9
 _UPRIGHT = 0.5
 """Least scalar of a quaternion near the identity: turned by 120 degrees at most."""
 _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
+
+Order = Literal["wxyz", "xyzw"]
+"""Order of a quaternion's numbers."""
 
 
 def as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
@@ -102,34 +111,49 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.float64]:
-    """Poses (M, 4, 4) `world_from_tool`, metres, of a file with positions in `unit`."""
+def read_poses(
+    path: str | os.PathLike[str], *, unit: str = "m", order: Order | None = None
+) -> NDArray[np.float64]:
+    """Poses (M, 4, 4) `world_from_tool`, metres, of a file with positions in `unit`.
+
+    order : of the four numbers of a quaternion, whatever their names; unless given by the header.
+    Matrices of a .npy file stay on disk until they are used.
+    """
     metres = metres_of(unit)
-    poses = poses_of(_read_rows(Path(path)))
-    poses[:, :3, 3] *= metres
+    if order not in {None, "wxyz", "xyzw"}:
+        raise UsageError(f"order {order!r}: give wxyz or xyzw")
+    is_array = Path(path).suffix.lower() == ".npy"
+    poses = _read_array(path, order or "wxyz") if is_array else poses_of(_read_rows(path, order))
+    if metres != 1.0:
+        poses[:, :3, 3] *= metres
     return poses
 
 
-def map_poses(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Poses (M, 4, 4) `world_from_tool`, metres, of a mapped .npy file; raises `FileError`."""
+def _read_array(path: str | os.PathLike[str], order: Order) -> NDArray[np.float64]:
+    """Poses (M, 4, 4) of a .npy file; raises `FileError`."""
     try:
-        found = np.load(path, mmap_mode="r")
+        found = as_floats(np.load(path, mmap_mode="c"), "poses")
     except OSError as error:
         raise FileError(f"{path}: {error.strerror or 'no .npy file'}") from None
     except ValueError as error:
         raise FileError(f"{path}: no .npy file of numbers: {error}") from None
-    if getattr(found, "shape", ())[1:] != (4, 4) or found.ndim != 3 or found.dtype != np.float64:
-        raise FileError(f"{path}: give an array of float64 of the shape (M, 4, 4)")
+    if found.shape[1:] not in {(4, 4), (7,)}:
+        raise FileError(f"{path}: it has the shape {found.shape}; give (M, 4, 4), or (M, 7)")
     if not len(found):
         raise FileError(f"{path}: it has no pose")
-    return found  # type: ignore[no-any-return]
+    if found.ndim == 3:
+        return found
+    names = [*"xyz", *(f"q{one}" for one in order)]
+    places = {name: names.index(name) for name in COLUMNS}
+    rows = [_pose(row, places, f"{path}, pose {n}") for n, row in enumerate(found.tolist())]
+    return poses_of(np.array(rows))
 
 
 def read_timed_poses(
     path: str | os.PathLike[str],
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
     """Times (M,), s, ascending, or None, and poses (M, 4, 4) `world_from_tool` of a file."""
-    rows = _read_rows(Path(path), optional="t")
+    rows = _read_rows(path, optional="t")
     if rows.shape[1] == len(COLUMNS):
         return None, poses_of(rows)
     times = rows[:, -1]
@@ -182,40 +206,56 @@ def _read_text(path: Path) -> str:
     return text
 
 
-def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
+def _read_rows(
+    path: str | os.PathLike[str], order: Order | None = None, optional: str = ""
+) -> NDArray[np.float64]:
     """Numbers (M, 7) by `COLUMNS`, quaternions normalised; (M, 8) with the optional column."""
-    text = _read_text(path)
-    head = text.lstrip().split("\n", 1)[0]
-    sign = next((sign for sign in ";\t" if sign in head and "," not in head), ",")
+    text = _read_text(Path(path))
+    head = re.sub(r"\A(\s*(#.*)?[\r\n])*", "", text).strip().splitlines()[:1] or [""]
+    sign = next((sign for sign in ",;\t " if sign in head[0].strip()), ",")
     if sign != ",":  # as spreadsheets write it with decimal commas
         text = text.replace(",", ".")
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=sign, strict=True)
+    reader = csv.reader(
+        io.StringIO(text, newline=""), delimiter=sign, strict=True, skipinitialspace=sign == " "
+    )
     places: dict[str, int] = {}
     rows: list[list[float]] = []
     try:
         for fields in reader:
-            if not any(field.strip() for field in fields):
+            if not any(field.strip() for field in fields) or fields[0].lstrip().startswith("#"):
                 continue
             where = f"{path}, line {reader.line_num}"
-            if places:
-                rows.append(_pose(fields, places, where))
-            else:
-                places = _columns(fields, where, optional)
+            if not places:
+                names = _names_of(fields, order or ("xyzw" if sign in "\t " else None))
+                places = _columns(names or fields, where, optional, None if names else order)
+                if not names:
+                    continue
+            rows.append(_pose(fields, places, where))
     except csv.Error as error:
         raise FileError(f"{path}, line {reader.line_num}: {error}; {_HINT}") from error
     if not rows:
         raise FileError(f"{path} holds no poses after its header; {_HINT}")
     found = np.array(rows)
-    if (np.abs(found[:, 3]) < 1e-9).all() and abs(found[0, 6]) > _UPRIGHT:
+    if order is None and (np.abs(found[:, 3]) < 1e-9).all() and abs(found[0, 6]) > _UPRIGHT:
         warnings.warn(
             f"{path}: all qw are 0, and the first pose is half a turn from the identity: are the "
-            "columns qx,qy,qz,qw?",
+            "columns qx,qy,qz,qw? Then read_poses(order='xyzw') reads them",
             stacklevel=3,
         )
     return found
 
 
-def _columns(fields: list[str], where: str, optional: str | None) -> dict[str, int]:
+def _names_of(fields: list[str], order: Order | None) -> list[str]:
+    """Names of the columns of a line of 7 or 8 numbers; empty for another one."""
+    try:
+        numbers = [*map(float, filter(str.strip, fields))]
+    except ValueError:
+        return []
+    names = ["t", *"xyz", *(f"q{one}" for one in order or "")]
+    return names[-len(numbers) :] if len(names) == 8 and len(numbers) in {7, 8} else []
+
+
+def _columns(fields: list[str], where: str, optional: str, order: Order | None) -> dict[str, int]:
     """Index of each of `COLUMNS` in the header, and of the optional column if it is there."""
     names = [field.strip().lower() for field in fields]
     missing = [name for name in COLUMNS if name not in names]
@@ -227,10 +267,12 @@ def _columns(fields: list[str], where: str, optional: str | None) -> dict[str, i
     doubled = [name for name in wanted if names.count(name) > 1]
     if doubled:
         raise FileError(f"{where}: the header names {', '.join(doubled)} twice; {_HINT}")
-    return {name: names.index(name) for name in wanted}
+    places = {name: names.index(name) for name in wanted}
+    turned = sorted(places[name] for name in COLUMNS[3:])
+    return places | {f"q{one}": place for one, place in zip(order or "", turned, strict=False)}
 
 
-def _pose(fields: list[str], places: dict[str, int], where: str) -> list[float]:
+def _pose(fields: Sequence[str | float], places: dict[str, int], where: str) -> list[float]:
     """Numbers of one line, all finite, with the quaternion normalised."""
     values: list[float] = []
     for name, place in places.items():
@@ -239,7 +281,9 @@ def _pose(fields: list[str], places: dict[str, int], where: str) -> list[float]:
         try:
             value = float(fields[place])
         except ValueError:
-            raise FileError(f"{where}: {name} is {fields[place][:40]!r}, not a number") from None
+            raise FileError(
+                f"{where}: {name} is {str(fields[place])[:40]!r}, not a number"
+            ) from None
         if not math.isfinite(value):
             raise FileError(f"{where}: {name} is {value}, not a finite number")
         if name in {"x", "y", "z"} and abs(value) > FARTHEST:

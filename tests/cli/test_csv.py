@@ -10,12 +10,12 @@ import pytest
 
 import hapticdb
 from command_line import Run, refused, succeeded
-from hapticdb.cli.emit import CsvWriter, text_cell
-from hapticdb.cli.schema import COLUMNS
 from hapticdb.cli.verbs.replaying import FRAMES
 from hapticdb.cli.verbs.touching import CONTACTS, TOUCHED
 from hapticdb.recording.file import Header, Recording
 from hapticdb.recording.frame import FRAME
+from hapticdb.tabular.schema import COLUMNS
+from hapticdb.tabular.tables import CsvWriter, text_cell
 from recordings import write
 from voxels import floor_voxels, write_voxels
 

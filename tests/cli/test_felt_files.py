@@ -10,7 +10,7 @@ from numba import cuda
 import hapticdb
 from command_line import Run, refused
 from hapticdb.batches import feeler
-from hapticdb.cli.schema import WRENCH
+from hapticdb.tabular.schema import WRENCH
 
 TOUCH = ("touch", "scene.db", "--tool", "tool.npz", "--poses")
 
@@ -63,12 +63,11 @@ def test_what_does_not_fit_is_told_in_a_line(
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     np.save(mapped.with_name("flat.npy"), np.eye(4))
     mapped.with_name("text.npy").write_text("no array")
-    refused(run(*TOUCH, "poses.npy"), "poses.npy", "--out")
     refused(run(*TOUCH, "path.csv", "--on", "cuda"), "--on", "without --out")
     refused(run(*TOUCH, "poses.npy", "--out", "f.npz", "--maxgap", 9), "--maxgap", "with --out")
     refused(run(*TOUCH, "poses.npy", "--out", "f.npz", "--csv", "-"), "--out", "--csv")
-    refused(run(*TOUCH, "poses.npy", "--out", "f.csv"), "f.csv", ".parquet or .npz")
-    refused(run(*TOUCH, "poses.npy", "--out", "poses.npy"), ".parquet or .npz")
+    refused(run(*TOUCH, "poses.npy", "--out", "f.xlsx"), "f.xlsx", ".parquet, .npz")
+    refused(run(*TOUCH, "poses.npy", "--out", "poses.npy"), ".parquet, .npz")
     refused(run(*TOUCH, "flat.npy", "--out", "f.npz"), "flat.npy", "(M, 4, 4)")
     refused(run(*TOUCH, "text.npy", "--out", "f.npz"), "text.npy", "no .npy file")
     refused(run(*TOUCH, "none.npy", "--out", "f.npz"), "none.npy")

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from command_line import Run
-from hapticdb.cli.emit import CsvWriter
-from hapticdb.cli.schema import COLUMNS, FIELDS, OBJECT, plain
-from hapticdb.cli.verbs.sweeping import SWEPT, _write
 from hapticdb.exact.swept import Gap, Swept
 from hapticdb.session.coupling import SettledCoupling
 from hapticdb.session.prefetch.resident_cells import CacheFigures
 from hapticdb.session.report import Report, Spread
+from hapticdb.tabular.schema import COLUMNS, FIELDS, OBJECT, plain
+from hapticdb.tabular.tables import CsvWriter
 from made_sweeps import line, place_at, swept, thing, touching
 
 PATH = line()
@@ -39,7 +38,7 @@ def test_a_sweep_as_json_has_no_infinity() -> None:
 
 
 def rows_of(found: Swept) -> list[dict[str, str]]:
-    _write(CsvWriter(stream := io.StringIO(newline=""), SWEPT), found)
+    CsvWriter(stream := io.StringIO(newline="")).write(found.columns())
     return [*csv.DictReader(stream.getvalue().splitlines())]
 
 

@@ -15,7 +15,6 @@ from numba import typeof
 
 from children import PATIENCE
 from hapticdb import Environment, PointShell
-from hapticdb.cli.schema import plain
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
 from hapticdb.kernels.period.loop import _layout_of
 from hapticdb.query.law import LawName
@@ -26,6 +25,7 @@ from hapticdb.resident.table import is_alive
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.report import Report
 from hapticdb.session.session import Session
+from hapticdb.tabular.schema import plain
 from recordings import motion, write
 from session import users_law
 from session.hands import Unplugged, still, stroking

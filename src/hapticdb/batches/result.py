@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 from hapticdb.query.law import ForceLaw
 from hapticdb.store.base import Object
+from hapticdb.tabular.schema import WRENCH, record
+from hapticdb.tabular.tables import Columns, Tabular, columns_of
 from hapticdb.units import notebook_html
 
 Floats = NDArray[np.float64]
@@ -27,7 +29,7 @@ class Named(NamedTuple):
     known: Mapping[int, Object]
 
 
-class TouchBatch:
+class TouchBatch(Tabular):
     """Contact forces of a tool at B poses, all of them at one committed revision.
 
     forces (B, 3) float64 : N, world frame, on the tool
@@ -74,6 +76,21 @@ class TouchBatch:
         )
         return notebook_html(self, rows)
 
+    def columns(self, first: int = 0) -> Columns:
+        """A row for each pose, numbered from `first` on; objects in contact if they are known."""
+        numbers = (
+            np.arange(first, first + len(self)), *map(np.ascontiguousarray, self.forces.T),
+            *map(np.ascontiguousarray, self.torques.T), self.hits, self.n_contacts, self.deepest,
+            np.full(len(self), self.revision),
+        )  # fmt: skip
+        names = ("pose", *WRENCH, "hits", "contacts", "deepest_m", "revision")
+        found = dict(zip(names, numbers, strict=True))
+        if self.named is None:
+            return found
+        known = self.named.known
+        touched = ([record(known[i], "id name") for i in self.ids_at(n)] for n in range(len(self)))
+        return found | columns_of(["touched"], ({"touched": one} for one in touched))
+
     @property
     def offsets(self) -> Ints:
         """Start of each pose's ids in `ids`, and the end of the last ones, (B + 1,)."""
@@ -106,7 +123,7 @@ class TouchBatch:
         return self.named
 
 
-class ClearanceBatch:
+class ClearanceBatch(Tabular):
     """Distances of a tool's points from the environment at B poses, at one committed revision.
 
     distances (B,) float64 : metres from the nearest of the shell's points to the nearest occupied
@@ -134,6 +151,15 @@ class ClearanceBatch:
             f"ClearanceBatch({len(self)} poses, {n_beyond} with nothing {reach}, {least}"
             f"revision {self.revision})"
         )
+
+    def columns(self) -> Columns:
+        """A row for each pose, with the index of the tool's nearest point."""
+        return {
+            "pose": np.arange(len(self)),
+            "distance_m": self.distances,
+            "point": self.points,
+            "revision": np.full(len(self), self.revision),
+        }
 
     @property
     def is_beyond(self) -> NDArray[np.bool_]:

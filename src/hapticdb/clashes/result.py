@@ -12,6 +12,8 @@ from hapticdb.clashes.rules import MEANT, Rules, parse_rule, rule_text
 from hapticdb.errors import UsageError
 from hapticdb.store.finding import NAME
 from hapticdb.store.pairs import KIND, KeptPairs, PairRow, Rule, Status
+from hapticdb.tabular.schema import plain
+from hapticdb.tabular.tables import Columns, Tabular, columns_of
 from hapticdb.units import length_text, notebook_html, volume_text
 from hapticdb.verdicts import REPORTED, Kind
 
@@ -19,6 +21,11 @@ Shown = Literal[Status, "accepted", "meant", "not looked at"]
 ASKED = REPORTED[:4]
 """Default kinds of findings: what shares material with something else, or is too near it."""
 
+PAIR_KEYS = (
+    "a", "a_name", "b", "b_name", "kind", "at_least", "at_most", "places", "status", "because",
+    "rule", "volume",
+)  # fmt: skip
+"""Keys of a pair's row."""
 MOST_SHOWN = 20
 """Pairs in a notebook; more are counted. Larger: a longer table."""
 
@@ -161,7 +168,7 @@ class Reach(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Clashes:
+class Clashes(Tabular):
     """Result of a search.
 
     told : pairs of this search; rest : rows of all other pairs, unchanged since the last call;
@@ -195,6 +202,10 @@ class Clashes:
         rows = [(one.a_name, one.b_name, one.kind, one.length_text()) for one in shown[:MOST_SHOWN]]
         more = len(shown) - len(rows)
         return notebook_html(self, rows + [(f"and {more:,} more", "", "", "")] * (more > 0))
+
+    def columns(self) -> Columns:
+        """A row for each pair, the gravest first."""
+        return columns_of(PAIR_KEYS, map(plain, self.pairs))
 
     @cached_property
     def pairs(self) -> tuple[Clash, ...]:

@@ -34,6 +34,7 @@ from hapticdb.cli.verbs.sweeping import HELP as SWEEP_HELP
 from hapticdb.cli.verbs.sweeping import sweep
 from hapticdb.cli.verbs.touching import touch
 from hapticdb.errors import HapticDBError
+from hapticdb.tabular.tables import printable
 
 __all__ = ["app", "main"]
 
@@ -105,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _fail(message: str, code: int, *, show_trace: bool = False) -> int:
     if show_trace:
-        sys.stderr.write(render.printable(traceback.format_exc()))
+        sys.stderr.write(printable(traceback.format_exc()))
     with contextlib.suppress(BrokenPipeError):
         render.note(message)
     return code

@@ -78,11 +78,12 @@ info.cold: With --calibrate: measure with empty caches, on SQLite.
 objects.name WORDS: Only these objects: 7 or 3,4, 'wheel*', attribute=value. Give it again for more.
 objects.limit N [40 on a terminal, all in a pipe]: Objects to list; 0: all.
 
-touch.poses FILE: Poses x,y,z,qw,qx,qy,qz with a header, or with --out a .npy of (M, 4, 4) matrices.
+touch.poses FILE: Poses x,y,z,qw,qx,qy,qz with a header, a TUM trajectory, a path as OMPL prints it,
+  or a .npy of (M, 4, 4) or (M, 7) numbers.
 touch.strategy: How the database is asked.
 touch.maxgap KEYS: Widest gap that the strategy maxgap reads across, in voxel keys.
 touch.contacts_csv FILE: Write every contact as CSV to a new file; - is standard output.
-touch.out FILE: Feel all poses as a batch, and write a table to a new file: .parquet or .npz.
+touch.out FILE: Feel all poses as a batch, and write a table to a new file: .csv, .parquet or .npz.
 touch.on cpu|cuda|ADDRESS: With --out, what computes: the processors, a GPU of NVIDIA, or workers of
   dask.distributed, by their scheduler, tcp://host:8786.
 
@@ -140,7 +141,7 @@ replay.recording FILE: A session's .hdbrec.
 replay.url URL: The environment; unless given, the recorded one if its file is beside FILE.
 
 sweep.part WORDS: Instead of --tool: objects that move, all together; chosen as for --exclude.
-sweep.path CSV: Poses x,y,z,qw,qx,qy,qz with a header.
+sweep.path FILE: Poses, as for touch --poses.
 sweep.about X,Y,Z/mm [middle of the tool's box]: the centre of the path's turns, tool's frame.
 sweep.batch CSV: Many sweeps, one a line; see above.
 sweep.seconds S [no limit]: Time of a sweep.
@@ -165,7 +166,7 @@ clashes.least_volume VOLUME [none is computed]: Cubic centimetres, or such as 5m
 clashes.html FILE: Write a page with pictures, a matrix and the table to a new file.
 clashes.junit FILE: Write findings and rules as JUnit test cases, for CI.
 clashes.bcf FILE: Write findings as topics of BCF 2.1, such as hall.bcfzip.
-clashes.poses CSV: Displacements x,y,z,qw,qx,qy,qz of --of, metres: say when it meets what.
+clashes.poses FILE: Displacements of --of, metres, as for touch --poses: say when it meets what.
 clashes.turn AXIS: Instead: turn --of about x, y or z, as on a hinge.
 clashes.about X,Y,Z/mm [middle of --of]: a point of the hinge, or the centre of turns, scene's
   frame.

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from unicodedata import category, east_asian_width
 
-from hapticdb.cli.schema import plain
+from hapticdb.tabular.schema import plain
+from hapticdb.tabular.tables import one_line, printable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
 
     from hapticdb.ingest.files import ImportCallback
 
-_UNPRINTABLE = re.compile(
-    "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
-)
-"""Control characters of terminals and of the direction of writing, without the line feed."""
 NEW_LINE = "\n"
 COLOURS = {0: 32, 1: 31}
 """Green and red of a terminal, by a verdict's exit code; others are yellow, 33."""
@@ -36,20 +33,6 @@ NARROW = 8
 """Least width of a shortened text, columns."""
 GAP, FACTS_GAP = 3, 2
 """Blanks between two columns of a table, and between a name and its value."""
-
-
-def printable(text: str) -> str:
-    r"""Text safe for a terminal; names of parts and files may contain any character.
-
-    Characters for cursor movements, colours or the direction of writing become escapes, such as
-    ``\x1b``.
-    """
-    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
-
-
-def one_line(text: str) -> str:
-    """Printable text with escaped line feeds."""
-    return printable(text).replace(NEW_LINE, "\\n")
 
 
 def note(text: str) -> None:

@@ -6,8 +6,8 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hapticdb.cli import render
-from hapticdb.cli.schema import plain
 from hapticdb.cli.tools import shell_record, shell_text
+from hapticdb.tabular.schema import plain
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.closing import Closes
 from hapticdb.environment.queries import Queries
-from hapticdb.errors import ReadOnlyError
+from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
 from hapticdb.ingest.geometry import shell_of_objects
@@ -180,17 +180,24 @@ class Environment(Queries, Closes):
         self._forget()
         return self.object(object_id)
 
-    def move(self, object_id: int, transform: ArrayLike, *, revision: int | None = None) -> Object:
+    def move(
+        self, object_id: int | str, transform: ArrayLike, *, revision: int | None = None
+    ) -> Object:
         """Move an object to a new pose, in one transaction.
 
+        object_id : or a word of `find` that selects one object
         transform (4, 4) : world_from_part, metres; replaces the present transform, scale included.
 
         Raises `ConflictError` if `revision` is given and the object has been written since;
         `OutsideGridError` for a pose beyond the grid.
         """
         self._check_writable()
-        old = self.object(object_id)
-        move_object(self._store, old, transform, revision)
+        if isinstance(object_id, str):
+            found = self.find(object_id)
+            if len(found) > 1:
+                raise UsageError(f"move: {object_id!r} selects {len(found)} objects: give one")
+            object_id = found[0].id
+        move_object(self._store, self.object(object_id), transform, revision)
         self._forget()
         return self.object(object_id)
 

@@ -1,17 +1,27 @@
 """Results of a sweep, decided on surfaces: metres and fractions of the path."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.exact.path import ToolPath
 from hapticdb.store.base import Object
+from hapticdb.tabular.schema import plain
+from hapticdb.tabular.tables import Columns, Tabular, columns_of
 from hapticdb.units import length_text, notebook_html
 from hapticdb.verdicts import PathVerdict
 
 Floats = NDArray[np.float64]
+
+SWEPT_KEYS = (
+    "what", "id", "name", "fraction", "segment", "on_tool", "on_object", "at_least", "until",
+    "start", "start_at_least", "reach", "by", "gap", "verdict",
+)  # fmt: skip
+"""Keys of a sweep's rows: an object hit, enclosed or touched at the start, and the nearest one;
+`what` names the case, and cells without meaning in a case are empty."""
 
 
 class PathPlace(NamedTuple):
@@ -67,7 +77,7 @@ class TouchedObject(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Swept:
+class Swept(Tabular):
     """Result of a sweep.
 
     Attributes
@@ -120,6 +130,20 @@ class Swept:
         found = f"by {', '.join(met[:3])}" if met else f"gap {length_text(self.gap.at_least)}"
         more = f" and {len(met) - 3} more" if len(met) > 3 else ""
         return f"Swept({self.verdict}, {found}{more}, {self.objects} objects, {self.elapsed:.2f} s)"
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """Records of hits along the path, enclosed and touched objects, and the nearest one."""
+        found: list[tuple[str, object, dict[str, Any]]] = [("hit", one, {}) for one in self.hits]
+        found += [("enclosed", obj, {}) for obj in self.enclosed]
+        found += [("touched", one, {}) for one in self.touching]
+        if self.gap.place is not None and self.is_free:
+            found.append(("nearest", self.gap.place, {"gap": self.gap.at_least, "at_least": None}))
+        for what, one, more in found:
+            yield {"what": what} | plain(one) | {"verdict": self.verdict} | more
+
+    def columns(self) -> Columns:
+        """A row for each object that is met, and for the nearest one."""
+        return columns_of(SWEPT_KEYS, self.records())
 
     def _repr_html_(self) -> str:
         """Table of the hits, for notebooks."""

@@ -9,7 +9,6 @@ import pytest
 
 from children import PATIENCE
 from hapticdb import Coupling, Environment, Handle, PointShell, TangentPlane
-from hapticdb.cli.schema import plain
 from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
 from hapticdb.devices.simulated import SimulatedDevice
@@ -20,6 +19,7 @@ from hapticdb.session.coupling import DirectRendering, SettledCoupling
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.report import Report
 from hapticdb.session.session import Session
+from hapticdb.tabular.schema import plain
 from session.hands import Beckoned, Steady, at, still
 from session.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
 from session.worlds import SIZE, make

@@ -11,9 +11,9 @@ import hapticdb
 from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.emit import TableOutput, new_files, open_csv
-from hapticdb.cli.schema import AXES, plain
 from hapticdb.cli.values import Point, budget_bytes, refuse
 from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import AXES, plain
 from hapticdb.units import length_text, place_text
 from hapticdb.verdicts import REPORTED, Kind
 
@@ -27,11 +27,6 @@ MOST_ROWS = 20
 """Rows of the table of groups or pairs; further ones are counted below it."""
 NOT_DECIDED = 3
 """Exit code of a search without a clash, but with pairs not yet measured."""
-PAIRS = (
-    "a", "a_name", "b", "b_name", "kind", "at_least", "at_most", "places", "status", "because",
-    "rule", "volume", "group",
-)  # fmt: skip
-"""Keys of `clashes --csv`: a row for each pair, the gravest first."""
 MEETINGS = ("id", "name", "begin", "end", "kind", "at_least", "place")
 """Keys with --poses or --turn: a row for each meeting, in the order of the motion."""
 
@@ -148,10 +143,11 @@ def clashes(
         refuse("with --poses and --turn", output, "html junit bcf")
         raise typer.Exit(_moved(url, pairs, motion, output))
     refuse("without --poses and --turn", motion)
+    from hapticdb.clashes.result import PAIR_KEYS
     from hapticdb.clashes.rules import add_rules
 
     with (
-        open_csv(output.csv, PAIRS) as table,
+        open_csv(output.csv, (*PAIR_KEYS, "group")) as table,
         new_files(**output.reports) as files,
         opened_to_keep(url) as env,
     ):

@@ -3,9 +3,9 @@
 from hapticdb.cli.choosing import chosen
 from hapticdb.cli.emit import Output
 from hapticdb.cli.root import left_at
-from hapticdb.cli.schema import OBJECT, record
 from hapticdb.cli.values import Point, numbers_of
 from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import OBJECT, record
 
 
 def move(

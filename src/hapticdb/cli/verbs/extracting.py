@@ -11,9 +11,9 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.choosing import FilterOptions, ids_of
 from hapticdb.cli.emit import Output
-from hapticdb.cli.schema import plain
 from hapticdb.cli.values import budget_bytes, numbers_of, point_of, refuse
 from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import plain
 from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from hapticdb.cli import render
 from hapticdb.cli.emit import Output
 from hapticdb.cli.options import CurveName, LayoutName, UnitName
 from hapticdb.cli.root import left_at
-from hapticdb.cli.schema import plain
 from hapticdb.cli.values import Point
 from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import plain
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:

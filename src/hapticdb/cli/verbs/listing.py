@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from hapticdb.cli import render
 from hapticdb.cli.choosing import as_named, opened_to_keep
 from hapticdb.cli.emit import Output
-from hapticdb.cli.schema import OBJECT, record
 from hapticdb.errors import AccessError, ObjectNotFoundError, UsageError
+from hapticdb.tabular.schema import OBJECT, record
 from hapticdb.units import length_text, place_text
 
 if TYPE_CHECKING:

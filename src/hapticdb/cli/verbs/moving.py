@@ -9,7 +9,7 @@ from hapticdb.cli import render
 from hapticdb.cli.emit import Output
 from hapticdb.cli.options import CurveName, LayoutName
 from hapticdb.cli.root import left_at
-from hapticdb.cli.schema import plain, record
+from hapticdb.tabular.schema import plain, record
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:

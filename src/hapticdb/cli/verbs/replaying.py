@@ -1,11 +1,13 @@
 """The verb replay."""
 
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
 from hapticdb.cli.emit import STDOUT, TableOutput, open_csv
 from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import COLUMNS
 
 if TYPE_CHECKING:
     from hapticdb.recording.file import Recording
@@ -64,11 +66,8 @@ def _write_frames(session: "Recording", target: str) -> None:
         assert table is not None  # noqa: S101 - a target was given
         for at in range(0, len(frames), PIECE):
             piece = frames[at : at + PIECE]
-            columns: list[list[object]] = []
-            for key in FRAMES:
-                for column in piece[key].reshape(len(piece), -1).T:
-                    is_single = column.dtype == "f4"
-                    columns.append([*map(str, column)] if is_single else column.tolist())
-            table.write(zip(*columns, strict=True))
+            columns = [piece[key].reshape(len(piece), -1).T for key in FRAMES]
+            names = [COLUMNS.get(key, (key,)) for key in FRAMES]
+            table.write(dict(zip(chain(*names), chain(*columns), strict=True)))
     if target != STDOUT:
         render.say(f"{target}: {render.counted(len(frames), 'frame')}")

@@ -4,19 +4,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.choosing import FilterOptions, ids_of
-from hapticdb.cli.emit import CsvWriter, TableOutput, open_csv
+from hapticdb.cli.emit import TableOutput, open_csv
 from hapticdb.cli.options import UnitName
-from hapticdb.cli.schema import plain
 from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
 from hapticdb.cli.tools import tool_of, warn_of_size
 from hapticdb.cli.values import Point
 from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import plain
 from hapticdb.units import length_text
 from hapticdb.verdicts import SWEEP_VERDICTS, WORST, exit_codes
 
@@ -31,13 +31,6 @@ if TYPE_CHECKING:
 
 MOST_OBJECTS = 20
 """Rows of the table of hits and contacts; the other objects are counted below it."""
-SWEPT = (
-    "what", "id", "name", "fraction", "segment", "on_tool", "on_object", "at_least", "until",
-    "start", "start_at_least", "reach", "by", "gap", "verdict",
-)  # fmt: skip
-"""Keys of `sweep --csv`: a row for each object hit, enclosed or touched at the start, and one for
-the nearest object; `what` names the case, and cells without meaning in a case are empty."""
-
 HELP = f"""Check whether a tool or part is free on a path: hits, places, the least gap.
 
 Clear by a gap: no surface meets the tool's. Slides: it moves along what it
@@ -115,16 +108,17 @@ def sweep(
 ) -> None:
     """Sweep a tool or parts along a path; the help text is `HELP`."""
     import hapticdb
+    from hapticdb.exact.swept import SWEPT_KEYS
 
     where, exclude = felt.where or [], felt.exclude or []
     one = Asked(tool, part or [], path or "", where, exclude, contact, "")
     _check(one, motion.tool_unit, batch, output.csv)
     asked = [one] if batch is None else read_sweeps(batch, one)
-    with open_csv(output.csv, SWEPT) as table, hapticdb.open(url, read_only=True) as env:
+    with open_csv(output.csv, SWEPT_KEYS) as table, hapticdb.open(url, read_only=True) as env:
         jobs = [_job(env, each, motion.path_unit) for each in asked]
         told = _all_swept(env, jobs, motion, output)
         if table:
-            _write(table, told[0].found)
+            table.add(*told[0].found.records())
         if batch is None and output.has_words:
             _show(told[0])
         elif output.has_words:
@@ -203,23 +197,6 @@ def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Told:
     if env.store.revision() != found.revision:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
     return _Told(job, shell, found, perf_counter() - began)
-
-
-def _write(table: CsvWriter, found: "Swept") -> None:
-    """Write rows: hits along the path, enclosed objects, contacts at the start, the nearest."""
-
-    def add(what: str, part: object, **more: object) -> None:
-        told: dict[str, Any] = plain(part)
-        table.add({"what": what} | told | {"verdict": found.verdict} | more)
-
-    for place in found.hits:
-        add("hit", place)
-    for obj in found.enclosed:
-        add("enclosed", obj)
-    for one in found.touching:
-        add("touched", one)
-    if found.gap.place is not None and found.is_free:
-        add("nearest", found.gap.place, gap=found.gap.at_least, at_least=None)
 
 
 def _show_batch(told: Sequence[_Told]) -> None:

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from hapticdb.cli import render
 from hapticdb.cli.choosing import FilterOptions
 from hapticdb.cli.emit import STDOUT, TableOutput, open_csv
-from hapticdb.cli.felt_files import columns_of, open_felt
 from hapticdb.cli.options import LawName, StrategyName, UnitName
-from hapticdb.cli.schema import record
 from hapticdb.cli.tools import ToolOptions, shell_record, shell_text
 from hapticdb.cli.values import refuse
 from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import record
+from hapticdb.tabular.tables import open_table
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,13 +82,18 @@ def touch(
     Example: hapticdb touch car.db --tool spanner.stl --poses path.csv --json
     """
     import hapticdb
+    from hapticdb.poses import read_poses
     from hapticdb.query.law import law_named
 
     if output.out is not None:
         refuse("with --out", query)
     if query.strategy != "maxgap":
         refuse("without --strategy maxgap", query, "maxgap")
-    path = _path_of(poses, path_unit, output)
+    if output.on == "cuda":
+        from hapticdb.batches.on_gpu import check_gpu
+
+        check_gpu()  # before kernels are compiled
+    path = read_poses(poses, unit=path_unit or "m")
     summary = _Summary()
     with (
         open_csv(output.csv, TOUCHED) as table,
@@ -118,21 +123,6 @@ def touch(
         summary.show(shell, name)
 
 
-def _path_of(poses: str, unit: UnitName | None, output: _Output) -> "NDArray[np.float64]":
-    """Poses of a CSV file, or of a .npy file, metres, for a batch alone; checks its GPU first."""
-    from hapticdb.poses import map_poses, read_poses
-
-    if output.on == "cuda":
-        from hapticdb.batches.on_gpu import check_gpu
-
-        check_gpu()  # before kernels are compiled
-    if not poses.lower().endswith(".npy"):
-        return read_poses(poses, unit=unit or "m")
-    if output.out is None or unit not in {None, "m"}:
-        raise UsageError(f"--poses {poses}: a .npy file is for --out, and in metres")
-    return map_poses(poses)
-
-
 def _touch_into(
     out: Path, shell: "PointShell", pieces: "Generator[TouchBatch, None, None]"
 ) -> None:
@@ -140,9 +130,9 @@ def _touch_into(
     import numpy as np
 
     first = n_touching = 0
-    with open_felt(out) as write, closing(pieces):
+    with open_table(out, "--out") as write, closing(pieces):
         for felt in pieces:
-            write(columns_of(first, felt))
+            write(felt.columns(first))
             first += len(felt)
             n_touching += int(np.count_nonzero(felt.n_contacts))
     render.facts([

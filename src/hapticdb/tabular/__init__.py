@@ -1,0 +1,1 @@
+"""Results as records and as tables: keys, columns, units, files."""

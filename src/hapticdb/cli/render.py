@@ -29,10 +29,10 @@ COLOURS = {0: 32, 1: 31}
 """Green and red of a terminal, by a verdict's exit code; others are yellow, 33."""
 ASCII = {"─": "-", "…": "...", "µ": "u", "±": "+-", "³": "3"}
 """Replacements of our own characters, for encodings without them."""
-NARROW = 8
+NARROW = 12
 """Least width of a shortened text, columns."""
-GAP, FACTS_GAP = 3, 2
-"""Blanks between two columns of a table, and between a name and its value."""
+GAP, NARROW_GAP, FACTS_GAP = 3, 1, 2
+"""Blanks between two columns of a table, of a shortened one, and between a name and its value."""
 
 
 def note(text: str) -> None:
@@ -81,17 +81,23 @@ def say_json(result: object) -> None:
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print rows under headings; ``>`` at a heading's end marks a column of numbers.
+    """Print rows under headings, or each row as facts on a terminal too narrow for columns.
 
-    A row on a terminal too narrow for the shortened texts is printed as facts.
+    ``>`` at a heading's end marks a column of numbers, ``?`` one omitted first.
     """
-    numbers, names = [one.endswith(">") for one in headings], [one.rstrip(">") for one in headings]
-    whole = [names, *rows]
-    lines = _laid(whole, numbers)
-    width = max(map(_width_of, lines)) + 2
+    columns = [*zip(headings, *rows, strict=True)]
+    while True:
+        numbers = [one[0].rstrip("?").endswith(">") for one in columns]
+        whole = [*zip(*((one[0].rstrip(">?"), *one[1:]) for one in columns), strict=True)]
+        lines = _laid(whole, numbers)
+        width = max(map(_width_of, lines)) + 2
+        omitted = [one for one in columns if one[0].endswith("?")]
+        if width <= _room() or not omitted:
+            break
+        columns.remove(omitted[-1])
     if width > _room():
         for row in whole[1:]:
-            facts(pair for pair in zip(names, row, strict=True) if pair[1])
+            facts(pair for pair in zip(whole[0], row, strict=True) if pair[1])
             print()
         return
     print("\n".join([f" {lines[0]}", "─" * width, *(f" {line}" for line in lines[1:])]))
@@ -129,7 +135,8 @@ def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool]) -> list[str]:
     cells = [[*map(one_line, row)] for row in rows]
     widths = [max(map(_width_of, column)) for column in zip(*cells, strict=True)]
     texts = [n for n, is_number in enumerate(numbers) if not is_number and widths[n] > NARROW]
-    room = _room() - 2 - GAP * (len(widths) - 1)
+    gap = GAP if sum(widths) + GAP * (len(widths) - 1) + 2 <= _room() else NARROW_GAP
+    room = _room() - 2 - gap * (len(widths) - 1)
     while sum(widths) > room and texts and max(widths[n] for n in texts) > NARROW:
         widths[max(texts, key=widths.__getitem__)] -= 1
     lines = []
@@ -140,7 +147,7 @@ def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool]) -> list[str]:
             blank + text if is_number else text + blank
             for text, blank, is_number in zip(row, blanks, numbers, strict=True)
         )
-        lines.append((" " * GAP).join(padded).rstrip())
+        lines.append((" " * gap).join(padded).rstrip())
     return lines
 
 

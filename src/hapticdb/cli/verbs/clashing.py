@@ -313,7 +313,7 @@ def _show_groups(groups: "list[Group]") -> None:
         for one in shown[:MOST_ROWS]
     ]  # fmt: skip
     if rows:
-        headings = ("group", "are", "pairs>", "parts>", "by>", "at, mm", "status", "which")
+        headings = ("group>", "are", "pairs>", "parts>?", "by>", "at, mm?", "status", "which")
         render.table(headings, rows)
     if len(shown) > MOST_ROWS:
         render.say(f"{len(shown):,} groups, {MOST_ROWS} of them shown; --csv writes all pairs")

@@ -150,7 +150,7 @@ def objects(
         rows = [
             (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in shown
         ]
-        render.table(("id>", "name", "voxels>", "size, mm>", "file"), rows)
+        render.table(("id>", "name", "voxels>", "size, mm>", "file?"), rows)
         if len(shown) < len(found):
             render.note(f"{len(shown):,} of {len(found):,} objects; --limit 0 shows all")
     else:

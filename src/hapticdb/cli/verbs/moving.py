@@ -136,7 +136,7 @@ def _show(found: "Difference", told: list[dict[str, Any]]) -> None:
         moved = f"{length_text(way)} ({way / size:.3g} voxels)" if way else ""
         rows.append((str(one["id"]), one["name"], one["what"], moved, one["link"]))
     if rows:
-        render.table(("id>", "name", "what", "moved by>", "file"), rows)
+        render.table(("id>", "name", "what", "moved by>", "file?"), rows)
         render.say(f"A: {found.a}; B: {found.b}")
     count = render.counted(len(told) + (not found.is_same_grid), "difference")
     render.say(count + (f", {MOST_LINES} of them shown" if len(told) > MOST_LINES else ""), 1)

@@ -9,17 +9,15 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import takewhile
 
 from hapticdb import interrupting
 from hapticdb.cli import render
 from hapticdb.cli.options import command
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
-from hapticdb.cli.verbs.clashing import HELP as CLASHES_HELP
 from hapticdb.cli.verbs.clashing import clashes
 from hapticdb.cli.verbs.editing import move, remove
-from hapticdb.cli.verbs.extracting import HELP as EXTRACT_HELP
 from hapticdb.cli.verbs.extracting import extract
 from hapticdb.cli.verbs.feeling import feel
 from hapticdb.cli.verbs.importing import import_
@@ -30,7 +28,6 @@ from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample
 from hapticdb.cli.verbs.serving import serve, view
-from hapticdb.cli.verbs.sweeping import HELP as SWEEP_HELP
 from hapticdb.cli.verbs.sweeping import sweep
 from hapticdb.cli.verbs.touching import touch
 from hapticdb.errors import HapticDBError
@@ -43,38 +40,15 @@ UNFORESEEN = 1
 INTERRUPTED = 130
 PIPE_CLOSED = 141
 
-VERBS: dict[Callable[..., None], str] = {
-    import_: "Import CAD files and point clouds.",
-    info: "Show engine, grid, layout, size; measure costs.",
-    objects: "List the objects of an environment.",
-    touch: "Touch with a tool along a path: force, torque, objects.",
-    feel: "Feel in real time with a device.",
-    view: "See and feel in a browser.",
-    serve: "Let others see and feel, in browsers and with devices.",
-    replay: "Run a recorded session again.",
-    sweep: "Check whether a tool or part is free along a path.",
-    clashes: "Find the parts that overlap, touch or are near.",
-    distance: "Measure how far two objects are apart.",
-    extract: "Search a path on which parts come out.",
-    move: "Move an object.",
-    remove: "Remove objects.",
-    copy: "Copy to another engine, layout or curve.",
-    diff: "Compare two environments.",
-    check: "Verify an environment.",
-    backup: "Copy an SQLite environment into a file, whole.",
-    grant: "Give a role rights, on PostgreSQL.",
-    demo: "Make, import, touch and draw the sample.",
-    sample: "Write a sample: a car, a spanner and its path.",
-}
-"""Verbs, each with its line in the list of verbs."""
+VERBS = (
+    import_, info, objects, touch, feel, view, serve, replay, sweep, clashes, distance, extract,
+    move, remove, copy, diff, check, backup, grant, demo, sample,
+)  # fmt: skip
+"""Verbs, as listed; their docstrings are their help texts."""
 HIDDEN = {sample}
 """Verbs omitted from the list of verbs: `demo` writes the sample itself."""
-HELP = {clashes: CLASHES_HELP, sweep: SWEEP_HELP, extract: EXTRACT_HELP}
-"""Help texts too long for a docstring, since functions have at most 60 lines."""
-for verb, summary in VERBS.items():
-    app.command(
-        verb.__name__.rstrip("_"), short_help=summary, help=HELP.get(verb), hidden=verb in HIDDEN
-    )(command(verb))
+for verb in VERBS:
+    app.command(verb.__name__.rstrip("_"), hidden=verb in HIDDEN)(command(verb))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -197,14 +197,6 @@ def box_record(bounds: "NDArray[np.float64] | None") -> dict[str, list[float]] |
     return {"low": low, "high": high, "extent": (bounds[1] - bounds[0]).tolist()}
 
 
-def percent(share: float) -> str:
-    """Share in per cent; a share below 1 is never rounded to 100 %."""
-    text = f"{100 * share:.3g}"
-    if share < 1.0 and text == "100":
-        text = ">99.9"
-    return f"{text} %"
-
-
 def shares(counts: Mapping[str, int]) -> str:
     """Counts as shares, largest first: ``array 93 %, cbgroup 7 %``."""
     total = sum(counts.values()) or 1

@@ -30,37 +30,35 @@ NOT_DECIDED = 3
 MEETINGS = ("id", "name", "begin", "end", "kind", "at_least", "place")
 """Keys with --poses or --turn: a row for each meeting, in the order of the motion."""
 
-HELP = """Say which parts meet, how deep, and which are near: every pair of an assembly.
+HELP = """Find the parts that overlap, touch or are near.
 
-Apart: farther than --contact. Touching: within --contact, or freed by a motion of
-so much. Overlapping: deeper. Inside: one lies in a closed body of the other. Not
-known: point clouds, which have no surface. The triangles decide.
+Apart: farther than --contact. Touching: within --contact, or freed by a motion of so much.
+Overlapping: deeper. Inside: one lies in a closed body of the other. Not known: point clouds, which
+have no surface. The triangles decide.
 
-The database keeps what is found. The next call measures only pairs of objects
-that were added, moved or replaced since, and says what is new, changed, gone or the
-same. --accept marks pairs as intended, until either part changes its shape.
+The database keeps what is found. The next call measures only pairs of objects that were added,
+moved or replaced since, and says what is new, changed, gone or the same. --accept marks pairs as
+intended, until either part changes its shape.
 
-Pairs are reported in groups, each one finding: copies of a pair, one part against
-many, and duplicates, which are equal parts at one place. The table has open groups
-alone; --all and --group list pairs.
---rules and --rule say what is meant, what to keep apart, and what to ignore; the
+Pairs are reported in groups, each one finding: copies of a pair, one part against many, and
+duplicates, which are equal parts at one place. The table has open groups alone; --all and --group
+list pairs. --rules and --rule say what is meant, what to keep apart, and what to ignore; the
 database keeps them, and the first rule that reaches a pair decides.
 
---least-volume measures the volume that two closed parts have in common, and drops
-smaller ones. Of open surfaces it is not known; such pairs stay.
+--least-volume measures the volume that two closed parts have in common, and drops smaller ones. Of
+open surfaces it is not known; such pairs stay.
 
-Ctrl-C and --seconds lose nothing: the next call goes on. Pairs that were not
-measured are counted.
+Ctrl-C and --seconds lose nothing: the next call goes on. Pairs that were not measured are counted.
 
---poses and --turn move the parts of --of together, and say in which intervals of the
-motion they meet each other object, and how deep. Where they do not is proved, as by
-sweep. Numbers are those of poses, from 0, or degrees. Nothing of it is kept.
+--poses and --turn move the parts of --of together, and say in which intervals of the motion they
+meet each other object, and how deep. Where they do not is proved, as by sweep. Numbers are those of
+poses, from 0, or degrees. Nothing of it is kept.
 
---html, --junit and --bcf write reports: a page, test cases for CI, and topics for
-the tools that made an IFC file, whose GlobalIds they carry.
+--html, --junit and --bcf write reports: a page, test cases for CI, and topics for the tools that
+made an IFC file, whose GlobalIds they carry.
 
-The exit code is 1 when a pair of a --kind was found that is neither accepted nor
-meant, 3 when there is none but not all pairs were looked at, and else 0.
+The exit code is 1 when a pair of a --kind was found that is neither accepted nor meant, 3 when
+there is none but not all pairs were looked at, and else 0.
 
 Example: hapticdb clashes car.db --of 'wheel*' --within 2
 """
@@ -128,7 +126,7 @@ class _Output(TableOutput):
 def clashes(
     url: str, *, pairs: PairOptions, meant: RuleOptions, motion: TurnOptions, output: _Output
 ) -> None:
-    """Find all pairs of near objects; the help text is `HELP`."""
+    """See `HELP`."""
     because, kinds = meant.because, pairs.kinds
     if because is not None:
         refuse("with --because", output, "csv html junit bcf")
@@ -173,6 +171,9 @@ def clashes(
             table.add(*told.records())
     told.say(url, output, is_grouped=meant.group is None and not meant.all_)
     raise typer.Exit(_exit_code(found, kinds))
+
+
+clashes.__doc__ = HELP
 
 
 class _Told(NamedTuple):

@@ -16,11 +16,11 @@ def move(
     matrix: str | None = None,
     output: Output,
 ) -> None:
-    """Move objects to a new place.
+    """Move objects.
 
-    --translate shifts all chosen objects in one transaction: all or none of them
-    move, even if the command is interrupted; --matrix places one object. 'hapticdb
-    objects --help' explains how to choose objects.
+    --translate shifts all chosen objects in one transaction: all or none of them move, even if the
+    command is interrupted; --matrix places one object. 'hapticdb objects --help' explains how to
+    choose objects.
 
     Example: hapticdb move car.db 17 --translate 0,0,0.25
 
@@ -53,9 +53,10 @@ def move(
 
 
 def remove(url: str, objects: list[str], *, output: Output) -> None:
-    """Remove objects, each in a transaction of its own.
+    """Remove objects.
 
-    'hapticdb objects --help' explains how to choose objects.
+    Each is removed in a transaction of its own. 'hapticdb objects --help' explains how to choose
+    objects.
 
     Example: hapticdb remove car.db 17 18
 

@@ -27,29 +27,25 @@ if TYPE_CHECKING:
 MOST_BLOCKERS = 10
 """Rows of the table of blockers, and of the table of failed searches."""
 
-HELP = f"""Search a path on which parts come out, judged by a sweep of their surfaces.
+HELP = f"""Search a path on which parts come out.
 
-The parts that WORDS choose move together as one rigid body. Straight pulls are
-tried first: along the axes, away from contacts and along them, at random; with
---screw then screw motions. If none leads out, a planner (OMPL, pip install ompl)
-searches a path round corners and with turns. A part is out when its bounding
-sphere is clear of the box of all other parts, or at --out. With --to, a path to a
-pose is searched instead.
+A sweep of the surfaces judges it. The parts that WORDS choose move together as one rigid body.
+Straight pulls are tried first: along the axes, away from contacts and along them, at random; with
+--screw then screw motions. If none leads out, a planner (OMPL, pip install ompl) searches a path
+round corners and with turns. A part is out when its bounding sphere is clear of the box of all
+other parts, or at --out. With --to, a path to a pose is searched instead.
 
-The path is written by --path as displacements from the present place, as
-'hapticdb sweep --part' takes them. The same seed gives the same path, unless
---seconds end the search.
+The path is written by --path as displacements from the present place, as 'hapticdb sweep --part'
+takes them. The same seed gives the same path, unless --seconds end the search.
 
-Overlaps count if they are more than --contact and --overlap. If no path is found,
-the parts that block most of the straight pulls are named.
+Overlaps count if they are more than --contact and --overlap. If no path is found, the parts that
+block most of the straight pulls are named.
 
-With --disassemble, what blocks the parts is taken off first, each object alone
-and on a path that is proved; --keep names what stays. Each step has a file of its
-own: --path out.csv writes out-1.csv and so on. The order may be longer than
-necessary.
+With --disassemble, what blocks the parts is taken off first, each object alone and on a path that
+is proved; --keep names what stays. Each step has a file of its own: --path out.csv writes out-1.csv
+and so on. The order may be longer than necessary.
 
---animation writes a page for any browser, with all that it needs in one file (pip
-install viser).
+--animation writes a page for any browser, with all that it needs in one file (pip install viser).
 
 {exit_codes(EXTRACT_VERDICTS)}
 
@@ -122,7 +118,7 @@ def extract(
     budget: float = 256.0,
     output: _Output,
 ) -> None:
-    """Search a removal path of parts; the help text is `HELP`."""
+    """See `HELP`."""
     import hapticdb
     from hapticdb.extraction.disassembly import disassemble
     from hapticdb.extraction.run import extract as search_way
@@ -151,6 +147,9 @@ def extract(
                 steps = [(found, chosen.left_out)] if found.way else []
         _report(env, found, steps, output)
     raise typer.Exit(found.verdict.exit_status)
+
+
+extract.__doc__ = HELP
 
 
 def _goal(to: str) -> "NDArray[np.float64]":

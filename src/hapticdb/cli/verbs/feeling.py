@@ -110,7 +110,7 @@ def feel(
     no_baseline: bool = False,
     output: Output,
 ) -> None:
-    """Feel an environment in real time with a device, then report the timing of the frames.
+    """Feel in real time with a device.
 
     Example: hapticdb feel car.db --tool spanner.stl --device path.csv --rate 1000 --seconds 10
     """

@@ -65,17 +65,16 @@ def import_(
     keep_removed: bool = False,
     output: Output,
 ) -> None:
-    """Import files into an environment; a missing environment is created.
+    """Import CAD files and point clouds.
 
-    Every part becomes an object, in a transaction of its own: after an
-    interruption, run the same command again to continue. An unusable file is
-    named and skipped, and the others are imported. Parts that were removed
-    are imported again, and counted, unless --keep-removed omits them.
+    A missing environment is created. Every part becomes an object, in a transaction of its own:
+    after an interruption, run the same command again to continue. An unusable file is named and
+    skipped, and the others are imported. Parts that were removed are imported again, and counted,
+    unless --keep-removed omits them.
 
-    Files are added to an existing environment. With --replace it follows the
-    files: objects of another geometry, place or unit are replaced under
-    their ids, moved ones go back, and those missing from the file are
-    removed; each in a transaction, so an interruption loses none.
+    Files are added to an existing environment. With --replace it follows the files: objects of
+    another geometry, place or unit are replaced under their ids, moved ones go back, and those
+    missing from the file are removed; each in a transaction, so an interruption loses none.
 
     Example: hapticdb import car.db car.glb --bits 11 --extent 1.6
 

@@ -22,11 +22,11 @@ MEANINGS: dict[RightName, str] = {
 
 
 def check(url: str, *, repair: bool = False, output: Output) -> None:
-    """Check a whole environment for damage, and print each defect on a line.
+    """Verify an environment.
 
-    The structure, rows, objects, surfaces, pairs and the log of changes are
-    compared. The exit code is 0 if the environment is sound, 1 if it is damaged, 2
-    if it cannot be read. --repair mends rows, then prints the remaining defects.
+    The structure, rows, objects, surfaces, pairs and the log of changes are compared; each defect
+    is a line. The exit code is 0 if the environment is sound, 1 if it is damaged, 2 if it cannot be
+    read. --repair mends rows, then prints the remaining defects.
 
     Example: hapticdb check car.db
     """
@@ -75,13 +75,12 @@ def _checked(report: "CheckReport") -> str:
 
 
 def backup(url: str, file: str, *, replace: bool = False, output: Output) -> None:
-    """Copy a whole SQLite environment into a file, while others work with it.
+    """Copy an SQLite environment into a file, whole.
 
-    The copy has the state of one moment, opens like any environment, and
-    appears only when it is complete. Other ways to copy the file miss the
-    changes in its log. --replace puts a copy back in place of an
-    environment; nobody may have that one open. On PostgreSQL use pg_dump
-    and pg_restore.
+    Others may work with it meanwhile. The copy has the state of one moment, opens like any
+    environment, and appears only when it is complete. Other ways to copy the file miss the changes
+    in its log. --replace puts a copy back in place of an environment; nobody may have that one
+    open. On PostgreSQL use pg_dump and pg_restore.
 
     Example: hapticdb backup car.db backups/monday.db
     """
@@ -97,11 +96,11 @@ def backup(url: str, file: str, *, replace: bool = False, output: Output) -> Non
 
 
 def grant(url: str, role: str, *, as_: RightName, output: Output) -> None:
-    """Set the rights of a role in an environment on PostgreSQL; the server enforces them.
+    """Give a role rights, on PostgreSQL.
 
-    A viewer reads and touches; a toucher also stores cost figures; an editor
-    also imports, moves and removes objects; nobody has no right. The grid
-    and the rights belong to the owner, who made the environment.
+    The server enforces them. A viewer reads and touches; a toucher also stores cost figures; an
+    editor also imports, moves and removes objects; nobody has no right. The grid and the rights
+    belong to the owner, who made the environment.
 
     Example: hapticdb grant postgresql://me@host/plant anna --as editor
     """

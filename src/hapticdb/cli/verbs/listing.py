@@ -37,11 +37,10 @@ SOURCES = {
 
 
 def info(url: str, *, calibrate: bool = False, cold: bool = False, output: Output) -> None:
-    """Show an environment's engine, grid, layout, scene, size and statistics.
+    """Show engine, grid, layout, size; measure costs.
 
-    --calibrate measures the cost of statements, index descents and rows, and
-    renews the statistics. The figures are stored in the environment; the
-    strategies cbgroup and auto use them.
+    --calibrate measures the cost of statements, index descents and rows, and renews the statistics.
+    The figures are stored in the environment; the strategies cbgroup and auto use them.
 
     Example: hapticdb info car.db --calibrate
     """
@@ -114,13 +113,12 @@ def objects(
     """List the objects of an environment.
 
     Verbs accept objects by id, by name, by pattern and by attribute. A name is a path, such as
-    body/door/handle. A name without / fits any element of a path, a name with /
-    the path from its start. The name of a sub-assembly means all objects below it.
-    In a pattern * stands for anything, ? for one character, [ab] for a or b;
-    case counts. attribute=value chooses the objects with this attribute; the
-    value may be a pattern, and outer.inner=value names a nested attribute. A word
-    with = is a name if an object has this name. A number is an id, or
-    a name if no object has this id; name=3 is a name.
+    body/door/handle. A name without / fits any element of a path, a name with / the path from its
+    start. The name of a sub-assembly means all objects below it. In a pattern * stands for
+    anything, ? for one character, [ab] for a or b; case counts. attribute=value chooses the objects
+    with this attribute; the value may be a pattern, and outer.inner=value names a nested attribute.
+    A word with = is a name if an object has this name. A number is an id, or a name if no object
+    has this id; name=3 is a name.
 
     Example: hapticdb objects car.db
 

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def distance(url: str, a: str, b: str, *, output: Output) -> None:
-    """Measure the distance between the surfaces of two objects, with the nearest points.
+    """Measure how far two objects are apart.
 
-    If A or B are several objects, the two nearest ones are measured. If
-    surfaces meet, 'hapticdb clashes --of A --against B' measures the depth.
+    The nearest points of their surfaces are printed. If A or B are several objects, the two nearest
+    ones are measured. If surfaces meet, 'hapticdb clashes --of A --against B' measures the depth.
 
     Example: hapticdb distance car.db body/hood body/windscreen
     """

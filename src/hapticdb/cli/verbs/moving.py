@@ -34,11 +34,10 @@ def copy(
     curve: CurveName | None = None,
     output: Output,
 ) -> None:
-    """Copy an environment, also to another engine, layout or curve.
+    """Copy to another engine, layout or curve.
 
-    Every object is copied in a transaction of its own, with its id: after an
-    interruption, run the same command again to continue. Edits made meanwhile
-    are not copied.
+    Every object is copied in a transaction of its own, with its id: after an interruption, run the
+    same command again to continue. Edits made meanwhile are not copied.
 
     Example: hapticdb copy car.db hilbert.db --curve hilbert
     """
@@ -70,12 +69,12 @@ def _copied(report: "CopyReport") -> str:
 
 
 def diff(a: str, b: str, *, output: Output) -> None:
-    """Compare two environments, and list their differences.
+    """Compare two environments.
 
-    Objects are paired by file and name. Their surfaces, places, attributes,
-    boxes and rows are compared; rows only if surface and place are the same,
-    and distances if both have them. The exit code is 0 if the environments
-    are equal, 1 if they differ. Ids, engine, layout and curve do not matter.
+    Objects are paired by file and name. Their surfaces, places, attributes, boxes and rows are
+    compared; rows only if surface and place are the same, and distances if both have them. The exit
+    code is 0 if the environments are equal, 1 if they differ. Ids, engine, layout and curve do not
+    matter.
 
     Example: hapticdb diff car.db hilbert.db
     """

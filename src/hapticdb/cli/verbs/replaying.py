@@ -22,12 +22,11 @@ FRAMES = (
 
 
 def replay(recording: str, url: str | None = None, *, output: TableOutput) -> None:
-    """Run a recorded session again, and compare tool, wrench and contacts.
+    """Run a recorded session again.
 
-    The exit code is 0 if all frames are equal bit for bit, 1 if some
-    differ or there was none to compare; the first difference is printed
-    with its reason. --csv writes the recorded frames and compares nothing;
-    it needs no environment.
+    Tool, wrench and contacts are compared. The exit code is 0 if all frames are equal bit for bit,
+    1 if some differ or there was none to compare; the first difference is printed with its reason.
+    --csv writes the recorded frames and compares nothing; it needs no environment.
 
     Example: hapticdb replay session.hdbrec car.db
     """

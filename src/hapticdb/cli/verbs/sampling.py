@@ -28,7 +28,7 @@ def sample(folder: Path, *, frames: int = 1000) -> None:
 def demo(
     folder: Path = Path("demo"), *, bits: int = 10, frames: int = 1000, points: int = 300
 ) -> None:
-    """Make a car, import it, slide a tool over it by every strategy, and draw the contacts.
+    """Make, import, touch and draw the sample.
 
     Example: hapticdb demo demo --bits 11
     """

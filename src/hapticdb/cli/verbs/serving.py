@@ -71,7 +71,7 @@ class ReachOptions:
 
 
 def view(url: str, *, page: PageOptions, no_browser: bool = False) -> None:
-    """See and feel an environment in a browser on this machine.
+    """See and feel in a browser.
 
     Example: hapticdb view car.db --tool spanner.stl
     """
@@ -100,7 +100,7 @@ def serve(
     reach: ReachOptions,
     log_json: bool = False,
 ) -> None:
-    """Let others see and feel an environment in browsers.
+    """Let others see and feel, in browsers and with devices.
 
     Example: hapticdb serve car.db --tool spanner.stl --token
     """

@@ -31,31 +31,28 @@ if TYPE_CHECKING:
 
 MOST_OBJECTS = 20
 """Rows of the table of hits and contacts; the other objects are counted below it."""
-HELP = f"""Check whether a tool or part is free on a path: hits, places, the least gap.
+HELP = f"""Check whether a tool or part is free along a path.
 
-Clear by a gap: no surface meets the tool's. Slides: it moves along what it
-touches where the path starts, and hits nothing. Overlaps: it hits nothing, but
-the part overlaps others by more than --contact and --overlap where it stands.
-Hits: the tool meets a surface, penetrates one that it touches, or one lies inside
-the other. Not decided: out of time (--seconds), or chord errors (STEP, IFC) leave
-it open. The triangles decide, between the poses, too; the gap is right to 0.01 mm
-or 1 %.
+Clear by a gap: no surface meets the tool's. Slides: it moves along what it touches where the path
+starts, and hits nothing. Overlaps: it hits nothing, but the part overlaps others by more than
+--contact and --overlap where it stands. Hits: the tool meets a surface, penetrates one that it
+touches, or one lies inside the other. Not decided: out of time (--seconds), or chord errors (STEP,
+IFC) leave it open. The triangles decide, between the poses, too; the gap is right to 0.01 mm or 1
+%.
 
-Between two poses the centre moves straight while the tool turns about it.
-Segment 0 leads from pose 0 to pose 1.
+Between two poses the centre moves straight while the tool turns about it. Segment 0 leads from pose
+0 to pose 1.
 
-With --part, objects of the environment are the tool, one rigid body; the poses
-are displacements from their place: x,y,z 0 and qw 1 leaves them there. 'hapticdb
-objects --help' says how names choose objects.
+With --part, objects of the environment are the tool, one rigid body; the poses are displacements
+from their place: x,y,z 0 and qw 1 leaves them there. 'hapticdb objects --help' says how names
+choose objects.
 
-The path is free of what is touched at the start if the tool, moved aside or
-deformed once by --contact, follows it and meets nothing; once they are farther
-apart than that, to meet it again is a hit. A foreign tool has no seat: if that
-does not free it at the first pose, it starts inside.
+The path is free of what is touched at the start if the tool, moved aside or deformed once by
+--contact, follows it and meets nothing; once they are farther apart than that, to meet it again is
+a hit. A foreign tool has no seat: if that does not free it at the first pose, it starts inside.
 
---batch reads a CSV file with the columns part or tool, and path; and if wanted
-where, exclude and contact (mm, or such as 0.2in). Several words in a cell stand
-with ; between.
+--batch reads a CSV file with the columns part or tool, and path; and if wanted where, exclude and
+contact (mm, or such as 0.2in). Several words in a cell stand with ; between.
 
 {exit_codes(SWEEP_VERDICTS)}
 A batch has the worst: 1 before 3 before 4 before 0.
@@ -106,7 +103,7 @@ def sweep(
     motion: SweepOptions,
     output: TableOutput,
 ) -> None:
-    """Sweep a tool or parts along a path; the help text is `HELP`."""
+    """See `HELP`."""
     import hapticdb
     from hapticdb.exact.swept import SWEPT_KEYS
 
@@ -125,6 +122,9 @@ def sweep(
             _show_batch(told)
     codes = {one.found.verdict.exit_status for one in told}
     raise typer.Exit(next(code for code in WORST if code in codes))
+
+
+sweep.__doc__ = HELP
 
 
 def _check(one: Asked, tool_unit: str | None, batch: str | None, csv: str | None) -> None:

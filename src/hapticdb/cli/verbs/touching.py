@@ -77,7 +77,7 @@ def touch(
     stiffness: float = 1000.0,
     output: _Output,
 ) -> None:
-    """Touch an environment with a tool along a path: force, torque, objects at every pose.
+    """Touch with a tool along a path: force, torque, objects.
 
     Example: hapticdb touch car.db --tool spanner.stl --poses path.csv --json
     """

@@ -1,4 +1,4 @@
-"""The demo: the sample in both layouts, under every strategy, timed and compared.
+"""The demo: four answers about the sample car, then its frames under every strategy.
 
 Hits, ids and wrench of every pose are compared bit for bit over strategies and layouts, under the
 tangent-plane law, the one common to all. Times are warm: each strategy has run before, and the
@@ -14,9 +14,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.clashes.groups import groups_of
+from hapticdb.clashes.rules import add_rules
+from hapticdb.clashes.run import WITHIN, find_clashes
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import GridError, UsageError
+from hapticdb.extraction.run import extract
+from hapticdb.extraction.verdict import extraction_line
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import ImportCallback, ImportOptions, import_files
 from hapticdb.paper.strategies import Strategy
@@ -25,6 +30,7 @@ from hapticdb.poses import read_poses
 from hapticdb.query.touches import Query, Touch
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout
+from hapticdb.units import length_text
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"
@@ -49,14 +55,24 @@ class Imported(NamedTuple):
 
 @dataclass(frozen=True)
 class DemoScene:
-    """Files and environments of the demo."""
+    """Files of the demo, and its environment on bricks."""
 
     folder: Path
     files: SampleFiles
-    imported: tuple[Imported, ...]
+    grid: GridOptions
+    imported: Imported
     shell: PointShell
     poses: NDArray[np.float64]
     grid_text: str
+
+
+class Answers(NamedTuple):
+    """An answer of each kind about the car, and the figures of the picture."""
+
+    lines: tuple[tuple[str, str], ...]
+    lid: NDArray[np.float64]  # (M, 4, 4) displacements of the trunk lid
+    force: NDArray[np.float64]  # (M,) newtons along the path of the tool
+    hits: NDArray[np.int64]  # (M,) number at each pose
 
 
 @dataclass(frozen=True)
@@ -71,23 +87,11 @@ class LayoutFigures:
         return float(np.median([query.elapsed_us for query in self.felt[strategy]]))
 
 
-@dataclass
-class Trace:
-    """Contacts along the path, for the picture; the same for every strategy."""
-
-    force: NDArray[np.float64]  # (M,) newtons
-    hits: NDArray[np.int64]  # (M,) number at each pose
-    points: NDArray[np.float64]  # (H, 3) of the hits, metres, world frame
-    ids: NDArray[np.int64]  # (H,) object that each hit, the lowest where several share a voxel
-    frames: NDArray[np.int64]  # (H,) pose of each
-
-
 @dataclass(frozen=True)
 class Comparison:
     """All strategies on all layouts, and their disagreements."""
 
     layouts: tuple[LayoutFigures, ...]
-    trace: Trace
     compared: int
     disagreed: tuple[str, ...]
 
@@ -119,23 +123,38 @@ def prepare(
     points: int = 300,
     progress: ImportCallback | None = None,
 ) -> DemoScene:
-    """Write the sample and import it in both layouts.
+    """Write the sample and import it on bricks.
 
     folder : of all files; bits : of an axis of the grid; frames : poses of the path; points : of
     the tool's shell; progress : as for `hapticdb.import_files`.
     """
-    options = GridOptions(bits=bits)
+    grid = GridOptions(bits=bits)
     home = Path(folder)
     files = write_sample(home, frames)
-    shell = PointShell.from_file(files.spanner, points)
-    layouts: tuple[tuple[Layout, str], ...] = (("brick", "car.db"), ("voxel", "car_voxel.db"))
-    imported = [
-        _import(str(home / name), files.car, layout, options, progress) for layout, name in layouts
-    ]
-    with open_environment(imported[0].url, read_only=True) as env:
-        grid_text = env.grid.describe()
-    poses = read_poses(files.path)
-    return DemoScene(home, files, tuple(imported), shell, poses, grid_text)
+    imported = _import(str(home / "car.db"), files.car, "brick", grid, progress)
+    with open_environment(imported.url, read_only=True) as env:
+        shell, grid_text = env.tool(files.spanner, points), env.grid.describe()
+    return DemoScene(home, files, grid, imported, shell, read_poses(files.path), grid_text)
+
+
+def answers(scene: DemoScene) -> Answers:
+    """Find clashes, a distance, a removal path and forces."""
+    with open_environment(scene.imported.url) as env:
+        add_rules(env.store, (), WITHIN, scene.files.rules)
+        groups = [one for one in groups_of(env.store, find_clashes(env).pairs) if one.is_open]
+        apart = env.distance("body/hood", "body/windscreen")
+        found = extract(env, "body/trunk_lid")
+        felt = env.touch(scene.shell, poses=scene.poses)
+    force = np.linalg.norm(felt.forces, axis=1)
+    clashes = (f"{one.title()}: {one.kind}, {one.length_text()}" for one in groups)
+    lines = (
+        ("what clashes?", "; ".join(clashes)),
+        ("does it fit?", f"hood and windscreen are {length_text(apart.at_most)} apart"),
+        ("does it come out?", f"the trunk lid {extraction_line(found)}"),
+        ("how does it feel?", f"a spanner pushed 1 mm into the car: up to {force.max():.3g} N"),
+    )
+    lid = np.eye(4)[None] if found.way is None else found.way.poses
+    return Answers(lines, lid, force, felt.hits)
 
 
 def _import(
@@ -159,20 +178,18 @@ def _import(
     )  # fmt: skip
 
 
-def compare(scene: DemoScene) -> Comparison:
-    """Touch at every pose by every strategy on every layout; time and compare the results."""
+def compare(scene: DemoScene, progress: ImportCallback | None = None) -> Comparison:
+    """Touch at every pose by every strategy on both layouts; time and compare the results."""
+    url = str(scene.folder / "car_voxel.db")
+    voxels = _import(url, scene.files.car, "voxel", scene.grid, progress)
     disagreed: list[str] = []
     layouts = []
     reference: list[Any] = []
-    trace: Trace | None = None
-    for imported in scene.imported:
+    for imported in (scene.imported, voxels):
         with open_environment(imported.url, read_only=True) as env:
             layouts.append(LayoutFigures(imported, _race(env, scene, reference, disagreed)))
-            if trace is None:
-                trace = _trace_of(env, scene.shell, scene.poses)
-    assert trace is not None  # noqa: S101 - the demo has two layouts
     compared = len(scene.poses) * len(COMPARED) * len(layouts)
-    return Comparison(tuple(layouts), trace, compared, tuple(disagreed))
+    return Comparison(tuple(layouts), compared, tuple(disagreed))
 
 
 def _race(
@@ -204,25 +221,4 @@ def _found(touched: Touch) -> tuple[bytes, bytes, bytes, tuple[int, ...]]:
         touched.torque.tobytes(),
         touched.hits.tobytes(),
         tuple(obj.id for obj in touched.objects),
-    )
-
-
-def _trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) -> Trace:
-    """Force, hits and their positions along a path."""
-    force, hits, points, ids, frames = [], [], [], [], []
-    for index, pose in enumerate(poses):
-        touched = env.touch(shell, pose, law="plane")
-        force.append(float(np.linalg.norm(touched.force)))
-        hits.append(len(touched.hits))
-        pairs = touched.pairs
-        _, first = np.unique(pairs[:, 0], return_index=True)
-        points.append(shell.points[pairs[first, 0]] @ pose[:3, :3].T + pose[:3, 3])
-        ids.append(pairs[first, 1])
-        frames.append(np.full(len(first), index, dtype=np.int64))
-    return Trace(
-        np.array(force),
-        np.array(hits, dtype=np.int64),
-        np.concatenate(points),
-        np.concatenate(ids),
-        np.concatenate(frames),
     )

@@ -1,6 +1,5 @@
-"""The demo's picture: the scene, the tool on its path, objects in contact, the force."""
+"""The demo's picture: the car, its trunk lid on the way out, the tool on its path, the force."""
 
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
-from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
 from hapticdb.ingest.geometry import parts_of
@@ -17,92 +15,69 @@ from hapticdb.pictures.canvas import Canvas
 from hapticdb.store.attributes import up_axis
 
 if TYPE_CHECKING:
-    from hapticdb.demo import Comparison, DemoScene, Trace
+    from hapticdb.demo import Answers, DemoScene
 
 SIZE, SCENE = (1600, 1000), (1600, 740)
 """Pixels of the picture, and of the scene in its upper part."""
-WINDOW = ((170, 30), (1480, 712))
+WINDOW = ((170, 80), (1440, 712))
 """Corners of the objects' area in the scene, pixels."""
-BASE, TOP = 970, 790
+BASE, TOP = 970, 810
 """Rows of no force and of the greatest one."""
-PAPER, FAINT, BODY, TOOL = "#0f1419", "#7d8896", "#6f7b89", "#e8e2d4"
-COLORS = ("#ffb000", "#35c6f4", "#ff5d73", "#7ee081", "#c792ff", "#ff8f4d")
-"""Of the objects hit most, the most hit one first."""
+PAPER, INK, BODY = "#e9edf3", "#242c38", "#9eb5cf"
+TOOL, FREE, FORCE = "#2bb5a0", "#3aa05c", "#eb6814"
+OUT = 0.45
+"""Share of the removal path at which the trunk lid is drawn."""
 TOOLS_SHOWN = 9
 """Number of poses with a picture of the tool."""
-LEFT, LINE = 35, 24
+LEFT, LINE = 35, 26
 """Pixels from the edge to the words, and from one line to the next."""
 
 
-def draw(path: Path, scene: "DemoScene", comparison: "Comparison") -> None:
-    """Draw the first environment of a demo and its contacts, and write a PNG."""
-    with open_environment(scene.imported[0].url, read_only=True) as env:
-        picture = _compose(env, scene, comparison)
+def draw(path: Path, scene: "DemoScene", found: "Answers") -> None:
+    """Draw the demo's environment with its answers, and write a PNG."""
+    picture = Image.new("RGB", SIZE, PAPER)
+    pen = ImageDraw.Draw(picture)
+    canvas = _scene(scene, found)
+    picture.paste(canvas.picture())
+    way = canvas.project(scene.poses[:, :3, 3])[:, :2]
+    pen.line([(x, y) for x, y in way.tolist()], fill=FORCE, width=2)
+    font = ImageFont.load_default(18)
+    for number, (question, answer) in enumerate(found.lines):
+        colour = FREE if "comes out " in answer else INK
+        pen.text((LEFT, LEFT + LINE * number), f"{question}  {answer}", fill=colour, font=font)
+    across = np.linspace(LEFT, SIZE[0] - LEFT, len(found.force))
+    down = BASE - (BASE - TOP) * found.force / max(float(found.force.max(initial=0.0)), 1e-9)
+    curve = list(zip(across.tolist(), down.tolist(), strict=True))
+    pen.line(curve, fill=FORCE, width=3)
+    pen.text((LEFT, TOP - 2 * LINE), "force along the path of the spanner", fill=INK, font=font)
     try:
         picture.save(path, "PNG")
     except OSError as error:
         raise FileError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> Image.Image:
-    trace, objects = comparison.trace, env.objects()
-    most = [i for i, _ in Counter(trace.ids.tolist()).most_common(len(COLORS))]
-    colors = dict(zip(most, COLORS, strict=False))
+def _scene(scene: "DemoScene", found: "Answers") -> Canvas:
+    """The car in its file's colours, the trunk lid, and some poses of the tool."""
+    with open_environment(scene.imported.url, read_only=True) as env:
+        objects = env.objects()
+        parts = [(obj, part) for obj, part in parts_of(env.store, objects)]
     boxes = np.array([obj.bounds for obj in objects])
     canvas = Canvas(boxes, SCENE, np.array(WINDOW, float), _rgb(PAPER), up_axis(objects))
-    parts = [(obj, part.surface()) for obj, part in parts_of(env.store, objects)]
-    tints = [np.tile(_rgb(colors.get(obj.id, BODY)), (len(faces), 1)) for obj, faces in parts]
-    canvas.fill(np.concatenate([faces for _, faces in parts]), np.concatenate(tints))
+    shift = OUT * (found.lid[-1, :3, 3] - found.lid[0, :3, 3])
+    for obj, part in parts:
+        triangles = part.surface()
+        tints = np.tile(_rgb(BODY), (len(triangles), 1))
+        if obj.name == "body/trunk_lid":
+            triangles, tints[:] = triangles + shift, _rgb(FREE)
+        elif part.colours is not None:
+            tints = part.colours[:, :3] / 255.0
+        canvas.fill(triangles, tints)
     tool = np.concatenate([part.triangles() for part in read_file(scene.files.spanner).parts])
     for index in np.linspace(0, len(scene.poses) - 1, TOOLS_SHOWN).astype(int):
         pose = scene.poses[index]
         canvas.fill(tool @ pose[:3, :3].T + pose[:3, 3], _rgb(TOOL))
-    picture = Image.new("RGB", SIZE, PAPER)
-    picture.paste(canvas.picture())
-    pen = ImageDraw.Draw(picture)
-    way = canvas.project(scene.poses[:, :3, 3])[:, :2]
-    pen.line([(x, y) for x, y in way.tolist()], fill="white", width=2)
-    names = {obj.id: obj.name.rsplit("/", 1)[-1].replace("_", " ") for obj in objects}
-    _write(pen, scene, comparison, [(names[i], color) for i, color in colors.items()])
-    _draw_force(pen, trace)
-    return picture
+    return canvas
 
 
 def _rgb(color: str) -> NDArray[np.float64]:
     return np.array(ImageColor.getrgb(color)[:3]) / 255.0
-
-
-def _write(
-    pen: ImageDraw.ImageDraw,
-    scene: "DemoScene",
-    comparison: "Comparison",
-    legend: list[tuple[str, str]],
-) -> None:
-    """Write the facts, and the names of the objects hit most, each in its colour."""
-    one, median_us = comparison.layouts[0].imported, comparison.layouts[0].median_us("auto")
-    facts = (
-        (
-            f"{one.objects} parts, {one.voxels / 1e6:.1f} million voxels, "
-            f"{one.bytes / 1e6:.1f} MB of {one.engine.split()[0]}"
-        ),
-        (
-            f"{len(scene.shell)} points of a spanner looked up {len(scene.poses):,} times, "
-            f"{median_us / 1000:.2f} ms each time"
-        ),
-    )
-    lines = [*((fact, FAINT) for fact in facts), *legend]
-    font = ImageFont.load_default(18)
-    for number, (words, color) in enumerate(lines):
-        pen.text((LEFT, LEFT + LINE * number), words, fill=color, font=font)
-
-
-def _draw_force(pen: ImageDraw.ImageDraw, trace: "Trace") -> None:
-    """Draw the force along the path, with its greatest value."""
-    most = float(trace.force.max(initial=0.0))
-    across = np.linspace(LEFT, SIZE[0] - LEFT, len(trace.force))
-    down = BASE - (BASE - TOP) * trace.force / max(most, 1e-9)
-    curve = list(zip(across.tolist(), down.tolist(), strict=True))
-    pen.polygon([(LEFT, BASE), *curve, (SIZE[0] - LEFT, BASE)], fill="#2a3644")
-    pen.line(curve, fill="white", width=2)
-    words = f"force along the path, at most {most:.3g} N"
-    pen.text((LEFT, TOP - 2 * LINE), words, fill=FAINT, font=ImageFont.load_default(18))

@@ -28,7 +28,7 @@ def sample(folder: Path, *, frames: int = 1000) -> None:
 def demo(
     folder: Path = Path("demo"), *, bits: int = 10, frames: int = 1000, points: int = 300
 ) -> None:
-    """Make, import, touch and draw the sample.
+    """Answer four questions about a car, draw it, then compare all strategies.
 
     Example: hapticdb demo demo --bits 11
     """
@@ -36,35 +36,28 @@ def demo(
 
     import numpy as np
 
-    from hapticdb.demo import compare, prepare
+    from hapticdb.demo import answers, compare, prepare
     from hapticdb.pictures.demo import draw
 
-    render.note(f"writing the sample into {folder}, importing it in both layouts ...")
+    render.note(f"writing the sample into {folder}, importing it ...")
     with render.import_bar() as progress:
         scene = prepare(folder, bits=bits, frames=frames, points=points, progress=progress)
-    _show_scene(scene)
-    comparison = compare(scene)
+    render.facts([("car", _import_text(scene.imported)), ("grid", scene.grid_text)])
+    found = answers(scene)
+    picture = folder / "demo.png"
+    draw(picture, scene, found)
+    url = quote(scene.imported.url)
+    view = f"{render.program()} view {url}"
+    render.facts([*found.lines, ("picture", str(picture)), ("see and feel it", view)])
+    render.note("importing it in the paper's layout, too, and comparing all strategies ...")
+    with render.import_bar() as progress:
+        comparison = compare(scene, progress)
     for measured in comparison.layouts:
-        _show_layout(measured, scene, float(np.median(comparison.trace.hits)))
+        _show_layout(measured, scene, float(np.median(found.hits)))
     render.say(f"\n{comparison.against_paper()}")
     render.say(comparison.verdict)
-    picture = folder / "demo.png"
-    draw(picture, scene, comparison)
-    render.say(f"picture: {picture}")
-    url = quote(scene.imported[0].url)
-    render.say(f"see it and feel it in a browser: {render.program()} view {url}")
     if comparison.disagreed:
         raise typer.Exit(1)
-
-
-def _show_scene(scene: "DemoScene") -> None:
-    rows = [
-        ("sample", ", ".join(str(path) for path in scene.files)),
-        ("grid", scene.grid_text),
-    ]
-    rows += [(f"import, {one.layout}", _import_text(one)) for one in scene.imported]
-    rows.append(("tool", f"{len(scene.shell)} points, {len(scene.poses):,} poses"))
-    render.facts(rows)
 
 
 def _import_text(one: "Imported") -> str:

@@ -49,7 +49,7 @@ def test_what_is_not_seen_is_not_felt_when_it_comes(
     browser = Browser.__new__(Browser)
     begun: list[bool] = []
     browser.site = SimpleNamespace(objects=dict.fromkeys((1, 3, 7)))  # type: ignore[assignment]
-    browser.scene = SimpleNamespace(hidden=hidden)  # type: ignore[assignment]
+    browser.scene = SimpleNamespace(hidden=hidden, shade=lambda: None)  # type: ignore[assignment]
     browser.chosen, browser.taken, browser._unfelt = (), None, felt_without
     monkeypatch.setattr(browser, "begin_anew", lambda: begun.append(True))
     browser.objects_changed()

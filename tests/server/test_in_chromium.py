@@ -85,14 +85,16 @@ def test_the_view_opens_by_its_link_and_works_under_the_policy(server: Running, 
     assert complaints != []
 
 
-def test_without_a_connection_the_page_says_that_it_connects(environment: Path, page: Page) -> None:
+def test_the_page_says_that_it_connects_and_that_the_server_has_ended(
+    environment: Path, page: Page
+) -> None:
     page.add_init_script(WATCHING)
     with running(Serving(urls(environment), tokens=TOKENS, page="viser_page:work")) as server:
         page.goto(f"{server.address}?token={next(iter(TOKENS))}", timeout=LONG)
         page.get_by_text(" is a ").wait_for(timeout=LONG)
         until(lambda: page.evaluate("cover()") == "none", "the page is seen", page)
         assert page.evaluate("was_covered")
-    until(lambda: "Connecting ..." in page.evaluate("cover()"), "its end is told", page)
+    until(lambda: "server has ended" in page.evaluate("cover()"), "its end is told", page)
 
 
 def test_a_person_signs_in_by_the_form(server: Running, page: Page) -> None:

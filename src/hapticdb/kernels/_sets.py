@@ -14,6 +14,8 @@ from hapticdb.kernels._machine_code import build, built_for, digest_of, group_of
 
 SHIPPED = Path(__file__).with_name("_machine")
 """Folder of the shipped sets, each under its group's name."""
+building: set[str] = set()
+"""Groups that this process is compiling now."""
 
 
 def code_of(entry: str) -> bytes | None:
@@ -53,11 +55,14 @@ def _built(group: str) -> tuple[Path, dict[str, str]] | None:
         f"processors ({_reason(manifest_of(SHIPPED / group).get('for'), built_for())})\n"
     )
     sys.stderr.flush()
+    building.add(group)
     try:
         _building.build_set(own_set(group), group)
     except OSError as error:
         sys.stderr.write(f"hapticdb: each kernel is compiled when it is first called: {error}\n")
         return None
+    finally:
+        building.discard(group)
     return _read(own_set(group))
 
 

@@ -59,7 +59,8 @@ class Browser:
         self.site, self.client, self.visitor = site, client, visitor
         self.number = number
         self.colour = colours.of_tool(self.number)
-        self.scene = BrowserScene(client, site.view.contents)
+        up = site.view.up
+        self.scene = BrowserScene(client, site.view.contents, up, float(site.facts.bounds[0, up]))
         self.chosen: tuple[int, ...] = ()
         self.taken: int | None = None
         self.tool: HeldTool = site.tools[0]
@@ -71,6 +72,8 @@ class Browser:
         self.has_moved = False
         """Whether the person has moved the hand."""
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY)
+        self.works: list[Any] = []
+        """Long jobs of the panels, `panels.working.Work`."""
         self._begun: float | None = None
         self._keeps_tool: bool | None = None  # of the requested session; None: no request
         self._over: list[HostedSession] = []  # detached, to end
@@ -371,6 +374,7 @@ class Browser:
         self.chosen = tuple(i for i in self.chosen if i in present)
         if self.taken is not None and self.taken not in present:
             self.taken = None
+        self.scene.shade()
         if not set(self.unfelt) <= set(self._unfelt):  # a hidden object has come back
             self.begin_anew()
 

@@ -64,6 +64,8 @@ class TabbedBrowser(Browser):
     def tick(self, now: float) -> None:
         """Show the newest frame, of the session and of a replay."""
         self.record.tick(now)
+        for work in self.works:
+            work.tick()
         contents = self.site.view.contents
         waiting = contents.waiting() if self._n_waiting else 0
         if waiting != self._n_waiting:

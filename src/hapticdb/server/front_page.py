@@ -35,20 +35,34 @@ LOADER = re.compile(
     re.DOTALL,
 )
 TITLE = "<title>Viser</title>"
+BUTTON = ".mantine-ActionIcon-root"
+HAS_GUI = (
+    f"body:has({BUTTON}:not([style*=none]) :is(.tabler-icon-adjustments,.tabler-icon-arrow-back))"
+)
+"""Selects the body once viser has had widgets of the page."""
 HIDING = (
-    "<style>#webgl-software-rendering,"
-    ".mantine-ActionIcon-root:has(.tabler-icon-adjustments,.tabler-icon-share)"
-    "{display:none!important}"
+    f"<style>#webgl-software-rendering,{BUTTON}:has(.tabler-icon-share)"
+    ",.tabler-icon-adjustments{display:none!important}"
+    f"{BUTTON}:has(.tabler-icon-adjustments){{width:auto}}"
+    f"{BUTTON}:has(.tabler-icon-adjustments)::after{{content:'Picture';font-size:.85rem}}"
+    ".tabler-icon-arrow-back{pointer-events:none}"
     ".mantine-Stack-root:has(>.mantine-TextInput-root input[value*='://'])"
     "{visibility:hidden!important}"
+    ".mantine-Button-root:has(.tabler-icon-photo){visibility:visible}"
+    "div:has(>.mantine-Button-root .tabler-icon-photo){order:-1}"
     "[data-dock-area]>*>.mantine-Text-root:only-child{visibility:hidden}"
-    "body:has(#root:empty,.tabler-icon-player-pause,.mantine-Loader-root[style*=absolute])::after{"
-    "content:'Connecting ...';position:fixed;inset:0;z-index:9999;display:grid;"
-    "place-items:center;background:#fafbfc;font:16px system-ui,sans-serif}</style>"
+    "div:has(>p>label:empty){display:none}"
+    "body::after{position:fixed;z-index:9999;font:16px system-ui,sans-serif}"
+    f"{HAS_GUI}:has(.tabler-icon-player-pause,.mantine-Loader-root[style*=absolute])::after{{"
+    "content:'The server has ended, or cannot be reached. You see the last picture.';"
+    "inset:0 0 auto;padding:.5rem 1rem;background:#c62838;color:#fff}"
+    f"body:not({HAS_GUI})::after{{content:'Connecting ...';inset:0;display:grid;"
+    "place-items:center;background:#fafbfc}</style>"
 )
-"""Hides viser's note about software rendering, its text in an empty tab, and its settings, which
-begin with the server's address, with their buttons. They stay laid out, because viser measures
-them. Covers everything while viser's panel shows its sign for a lost connection."""
+"""Hides viser's note about software rendering, its text in an empty tab, the place of an empty
+label, and its settings, which begin with the server's address. They stay laid out, because viser
+measures them; their button for pictures stays. Covers everything until the first widgets come; a
+line on top reports a lost connection."""
 
 
 class ClientPage(NamedTuple):

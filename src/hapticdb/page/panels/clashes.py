@@ -53,7 +53,7 @@ class ClashPanel:
         )
         look = gui.add_button("Look for clashes", hint="Measures pairs of parts that have changed.")
         look.on_click(guard("viewer", self._look))
-        self._work = Work(browser, gui, "a search for clashes")
+        self._work = Work(browser, gui, "a search for clashes", "pairs")
         self._kind = gui.add_dropdown("Kind", (ALL, *REPORTED))
         self._status = gui.add_dropdown("Status", STATUSES)
         self._words = gui.add_text("Words", "", hint="Parts of both names, in any order.")

@@ -68,7 +68,7 @@ class SweepPanel:
         )
         self._run = gui.add_button("Run the sweep")
         self._run.on_click(guard("viewer", self._begin))
-        self._work = Work(browser, gui, "a sweep")
+        self._work = Work(browser, gui, "a sweep", "parts near the way")
         self._clear = gui.add_button("Clear", color="gray", visible=False)
         self._clear.on_click(guard("viewer", self._clean))
 

@@ -13,7 +13,7 @@ from hapticdb.page.scene.contents import Contents
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.nodes import Member
 from hapticdb.page.scene.picking import Struck
-from hapticdb.page.scene.surroundings import FIELD_OF_VIEW
+from hapticdb.page.scene.surroundings import FIELD_OF_VIEW, add_shadow
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
@@ -55,16 +55,19 @@ class _Look:
 class BrowserScene:
     """The scene as seen by one browser, until `Contents.leave`.
 
+    up : number of the vertical axis; ground : height of the shadow, metres.
+
     Changes by others show here too, unless hidden here. All methods are thread-safe, and accept ids
     of removed objects.
     """
 
-    def __init__(self, client: "ClientHandle", contents: Contents) -> None:
-        self._client = client
-        self._contents = contents
+    def __init__(self, client: "ClientHandle", contents: Contents, up: int, ground: float) -> None:
+        self._client, self._contents = client, contents
+        self._up, self._ground = up, ground
         self._key = client.client_id
         self._look = _Look()
         contents.watch(self._key, Audience(client.scene), self._look.colour)
+        self.shade()
 
     @property
     def hidden(self) -> set[int]:
@@ -83,6 +86,7 @@ class BrowserScene:
                 if self._look.isolated is not None:
                     self._look.isolated |= shown
             self._draw(before ^ self.hidden)
+        self.shade()
 
     def hide(self, ids: Iterable[int]) -> None:
         """Hide objects in this browser, also from picking."""
@@ -90,6 +94,7 @@ class BrowserScene:
             hidden = set(ids)
             self._look.hidden |= hidden
             self._draw(hidden)
+        self.shade()
 
     def isolate(self, ids: Iterable[int]) -> None:
         """Hide all other objects; `show` without ids ends it."""
@@ -98,6 +103,12 @@ class BrowserScene:
             self._look.isolated = frozenset(ids)
             self._look.hidden -= self._look.isolated
             self._draw(before ^ self.hidden)
+        self.shade()
+
+    def shade(self) -> None:
+        """Draw the shadow of the objects that are shown here."""
+        boxes = self._contents.boxes(self._look.sees)
+        add_shadow(self._client.scene, boxes, self._up, self._ground)
 
     def highlight(self, ids: Iterable[int]) -> None:
         """Highlight these objects alone."""

@@ -206,14 +206,16 @@ class Contents:
         with self.lock:
             return self._targets.first(origin, direction, sees)
 
+    def boxes(self, sees: Callable[[int], bool] = lambda _: True) -> NDArray[np.float64]:
+        """AABBs (n, 2, 3) of the objects of `sees` as shown now, metres."""
+        with self.lock:
+            boxes = [member.box for member in self._members.values() if sees(member.id)]
+        return np.array(boxes).reshape(-1, 2, 3)
+
     def box(self) -> NDArray[np.float64] | None:
         """AABB (2, 3) of all objects as shown now, metres; None without objects."""
-        with self.lock:
-            boxes = [member.box for member in self._members.values()]
-        if not boxes:
-            return None
-        stacked = np.stack(boxes)
-        return np.stack([stacked[:, 0].min(axis=0), stacked[:, 1].max(axis=0)])
+        boxes = self.boxes()
+        return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]) if len(boxes) else None
 
     def waiting(self) -> int:
         """Number of objects without a shape yet."""

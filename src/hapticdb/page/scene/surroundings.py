@@ -103,8 +103,14 @@ def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
     )
 
 
-def add_shadow(scene: "SceneApi", boxes: NDArray[np.float64], up: int) -> None:
-    """Add a soft shadow of AABBs (n, 2, 3), metres, on the ground: an image, free to render."""
+def add_shadow(scene: "SceneApi", boxes: NDArray[np.float64], up: int, ground: float) -> None:
+    """Replace the soft shadow by that of AABBs (n, 2, 3), metres: an image, free to render.
+
+    ground : its height, metres.
+    """
+    if not len(boxes):
+        scene.remove_by_name("/shadow")
+        return
     axes = [(up + 1) % 3, (up + 2) % 3]
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)
@@ -119,7 +125,7 @@ def add_shadow(scene: "SceneApi", boxes: NDArray[np.float64], up: int) -> None:
     image = np.zeros((SHADOW_PIXELS, SHADOW_PIXELS, 4), dtype=np.uint8)
     image[..., 3] = np.round(255 * SHADOW * gaussian_filter(covered, sigma))
     place = (low + high) / 2
-    place[up] = low[up] - 1e-3 * radius
+    place[up] = ground - 1e-3 * radius
     turn = np.eye(3)[[*axes, up]].T
     scene.add_image(
         "/shadow",

@@ -17,7 +17,7 @@ from hapticdb.page.scene.facets import Facets, block_facets, coarsened
 from hapticdb.page.scene.following import Follower
 from hapticdb.page.scene.reading import MOST_BLOCKS, ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
-from hapticdb.page.scene.surroundings import add_shadow, add_surroundings
+from hapticdb.page.scene.surroundings import add_surroundings
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 
@@ -119,7 +119,6 @@ class SceneView:
             self._is_surrounded = True
             self.up = up_axis(objects)
             add_surroundings(self._server, box, self.up)
-            add_shadow(self._server.scene, np.array([obj.bounds for obj in objects]), self.up)
 
     def _show_shapes(self, found: Sequence[ShapedObject]) -> None:
         with self._server.atomic():

@@ -5,16 +5,17 @@ import os
 import pty
 import shutil
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import pytest
 import trimesh
 
 import hapticdb
-from children import child
+from children import joined
 from hapticdb.cli import main
 from hapticdb.paper.cost_model import CostModel, machine_name
 
@@ -42,17 +43,27 @@ def command(*args: object) -> list[str]:
     return [sys.executable, "-m", "hapticdb", *map(str, args)]
 
 
-def on_terminal(*args: object) -> str:
-    """What a terminal shows of a command in a process of its own."""
+def on_terminal(*args: object, out: TextIO | None = None, code: int = 0) -> str:
+    """What a terminal shows of a command; `out` : where standard output goes instead."""
     ours, theirs = pty.openpty()
-    with child(command(*args), stdout=theirs, stderr=theirs) as process:
-        os.close(theirs)
-        seen = b""
+    seen = bytearray()
+
+    def read() -> None:
         with contextlib.suppress(OSError):  # the other side is closed
             while chunk := os.read(ours, 4096):
-                seen += chunk
+                seen.extend(chunk)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    with (
+        os.fdopen(theirs, "w") as screen,
+        contextlib.redirect_stdout(out or screen),
+        contextlib.redirect_stderr(screen),
+    ):
+        ended = main([str(arg) for arg in args])
+    joined(reader)
     os.close(ours)
-    assert process.returncode == 0
+    assert ended == code
     return seen.decode()
 
 

@@ -21,14 +21,14 @@ from assemblies import (
     voxel_set,
     write_obj,
 )
-from hapticdb import Environment, PointShell
+from hapticdb import Environment, Object, PointShell
 from hapticdb.check import check_environment
-from hapticdb.environment import opened
 from hapticdb.grid import CurveName
-from hapticdb.ingest import files
-from hapticdb.mesh import MeshFile, parse_in_process
+from hapticdb.ingest import moving
+from hapticdb.ingest.geometry import parts_of
+from hapticdb.mesh import parse_in_process
 from hapticdb.paper.cost_model import machine_name
-from hapticdb.store.base import Layout
+from hapticdb.store.base import Layout, Store
 from mesh_files import gltf
 from voxels import KINDS
 
@@ -60,13 +60,6 @@ def write_balls(path: Path, *placed: NDArray[np.float64]) -> Path:
     ]
     tree = {"nodes": nodes, "scenes": [{"nodes": list(range(len(nodes)))}]}
     return gltf(tree, path, vertices.astype(np.float32), faces.ravel().tolist())
-
-
-@pytest.fixture
-def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parse files in this process: the tests' own files are sound, and a child takes longer."""
-    for module in (opened, files):
-        monkeypatch.setattr(module, "read_file", parse_in_process)
 
 
 def test_objects_are_those_of_the_newest_revision(env: Environment, tmp_path: Path) -> None:
@@ -104,7 +97,6 @@ def test_a_list_that_failed_is_read_again(
         assert [obj.id for obj in other.objects()] == [obj.id for obj in wanted[2:]]
 
 
-@pytest.mark.usefixtures("without_child")
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 def test_a_moved_object_is_as_if_imported_there(
     tmp_path: Path, layout: Layout, curve: CurveName
@@ -142,7 +134,6 @@ def test_a_moved_object_is_as_if_imported_there(
         assert index_rows(env) == before
 
 
-@pytest.mark.usefixtures("without_child")
 def test_any_series_of_moves_ends_as_a_fresh_import(tmp_path: Path) -> None:
     """No row of an earlier place remains, even when that place was at the grid's border."""
     rng = np.random.default_rng(11)
@@ -220,7 +211,7 @@ def test_a_placement_out_of_the_grid_or_that_is_none_is_refused(env: Environment
 
 
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
-def test_a_move_by_another_while_the_file_is_read_leaves_no_stray_rows(
+def test_a_move_by_another_while_the_part_is_read_leaves_no_stray_rows(
     tmp_path: Path, layout: Layout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two editors move one object at once: it ends at the place of the last writer only."""
@@ -228,13 +219,14 @@ def test_a_move_by_another_while_the_file_is_read_leaves_no_stray_rows(
     hapticdb.import_files(tmp_path / "e.db", [file], small_options("z", layout))
     env, other = hapticdb.open(tmp_path / "e.db"), hapticdb.open(tmp_path / "e.db")
 
-    def read_while_another_moves(link: str, *, unit: str | None = None) -> MeshFile:
-        monkeypatch.setattr(opened, "read_file", parse_in_process)
+    def read_while_another_moves(store: Store, objects: list[Object]) -> object:
+        monkeypatch.undo()
         other.move(1, placement(0.1, 0, 0))
-        return parse_in_process(link, unit=unit)
+        return parts_of(store, objects)
 
-    monkeypatch.setattr(opened, "read_file", read_while_another_moves)
+    monkeypatch.setattr(moving, "parts_of", read_while_another_moves)
     moved = env.move(1, placement(0, 0.1, 0))
+    assert moved.revision == 3
     np.testing.assert_array_equal(moved.transform, placement(0, 0.1, 0))
     once = index_rows(env)
     env.move(1, np.eye(4))

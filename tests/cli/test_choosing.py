@@ -34,7 +34,10 @@ def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
         assert [one["name"] for one in found["hits"]] == ["box1"] * (n == 1)
         assert found["excluded"] == sorted({1, 2, 3} - {n + 1})
     hand = ("--tool", "tool.npz", "--device", "path.csv", "--rate", 200)
-    code, out, err = run("feel", scene, *hand, "--json", "--where", "box*", "--exclude", "up=?")
+    code, out, err = run(
+        "feel", scene, *hand, "--json", "--where", "box*", "--exclude", "up=?",
+        "--no-baseline", "--seconds", 0.2,
+    )  # fmt: skip
     assert (code, json.loads(out)["hit_frames"]) == (0, 0), err
     for verb in (("touch", scene, *TOUCH), ("feel", scene, *hand), ("sweep", scene, *path)):
         refused(run(*verb, "--where", "ball"), "--where: no object 'ball'")

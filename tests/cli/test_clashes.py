@@ -3,9 +3,8 @@
 import base64
 import csv
 import html
+import io
 import json
-import os
-import pty
 import re
 import zipfile
 from pathlib import Path
@@ -17,8 +16,7 @@ import pytest
 
 import hapticdb
 from assemblies import ball, box, row_of_boxes, write_obj
-from children import PATIENCE, child
-from command_line import Run, command, refused
+from command_line import Run, on_terminal, refused
 from hapticdb.pictures import reports
 from hapticdb.pictures.clashes import snapshot
 
@@ -128,7 +126,8 @@ def test_duplicates_give_exit_code_1(run: Run, tmp_path: Path) -> None:
 
 def test_a_buried_part_gives_exit_code_1(run: Run, tmp_path: Path) -> None:
     parts = {"wall": box((0, 0, 0), (1, 1, 1)), "pipe": ball((0.5, 0.5, 0.5), 0.1)}
-    hapticdb.import_files(tmp_path / "a.db", [write_obj(tmp_path / "a.obj", parts)])
+    coarse = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6))
+    hapticdb.import_files(tmp_path / "a.db", [write_obj(tmp_path / "a.obj", parts)], coarse)
     code, out, _ = run("clashes", tmp_path / "a.db")
     assert (code, "inside" in out) == (1, True)
 
@@ -246,9 +245,7 @@ def test_volumes_are_told_and_a_floor_decides(run: Run, meeting: Path, tmp_path:
 
 
 def test_standard_output_has_the_result_while_a_terminal_shows_the_bar(meeting: Path) -> None:
-    ours, theirs = pty.openpty()
-    with child(command("clashes", meeting, "--json"), stderr=theirs) as process:
-        os.close(theirs)
-        out, _ = process.communicate(timeout=PATIENCE)
-    os.close(ours)
-    assert [json.loads(line)["kind"] for line in out.splitlines()] == ["overlapping", "touching"]
+    shown = on_terminal("clashes", meeting, "--json", out=(out := io.StringIO()), code=1)
+    assert "pairs" in shown
+    kinds = [json.loads(line)["kind"] for line in out.getvalue().splitlines()]
+    assert kinds == ["overlapping", "touching"]

@@ -8,8 +8,7 @@ import pytest
 
 import hapticdb
 from children import finished
-from command_line import boxes
-from hapticdb import GridOptions, ImportOptions
+from command_line import Run, succeeded
 from postgres_servers import Binaries
 from servers import FOUND, named, url_on
 from validity import assert_valid, contents
@@ -38,29 +37,32 @@ sys.exit(main())
 """A program: the command line, which meets a signal or a full disk when two objects are written."""
 
 
+CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9, "full disk": 2}
+
+
 @pytest.mark.parametrize(
     ("engine", "how"),
     [
-        *((engine, how) for engine in (None, *FOUND) for how in ("SIGINT", "SIGTERM", "SIGKILL")),
-        (None, "full disk"),
+        *((None, how) for how in CODES),
+        *((engine, how) for engine in FOUND for how in ("SIGINT", "SIGKILL")),
     ],
     ids=lambda value: value if isinstance(value, str) else named(value),
 )
-def test_a_move_cut_off_moves_none(tmp_path: Path, engine: Binaries | None, how: str) -> None:
-    with url_on(engine, tmp_path) as url:
-        options = ImportOptions(grid=GridOptions(bits=7, extent=3.0))
-        hapticdb.import_files(url, [boxes(tmp_path / "boxes.glb")], options)
+def test_a_move_cut_off_moves_none(
+    run: Run, scene: Path, engine: Binaries | None, how: str
+) -> None:
+    with url_on(engine, scene.parent) as url:
+        hapticdb.copy_environment(scene, url)
         with hapticdb.open(url, read_only=True) as env:
             before = contents(env)
             command = ["move", url, "box*", "--translate", "0,0,0.1"]
             done = finished([sys.executable, "-c", CUT_OFF, how, *command])
-            codes = {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9, "full disk": 2}
-            assert (done.returncode, done.stdout) == (codes[how], ""), done.stderr
+            assert (done.returncode, done.stdout) == (CODES[how], ""), done.stderr
             assert "Traceback" not in done.stderr
             if how == "SIGINT":
                 assert "all that was chosen has moved, or nothing" in done.stderr
             assert contents(env) == before
-            finished([sys.executable, "-m", "hapticdb", *command], check=True)
+            succeeded(run(*command))
             heights = [obj.transform[2, 3] for obj in env.objects()]
             np.testing.assert_allclose(heights, 0.1)
             assert_valid(env)

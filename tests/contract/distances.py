@@ -131,12 +131,13 @@ class DistancesContract(StoreCase):
         frame = LocatedShell(np.zeros((len(voxels) + 1, 6)), addresses, 1.0, NO_KEYS)
         ordinals, ids = band.statement_hits(frame)
         found = {(*voxels[n].tolist(), i) for n, i in zip(ordinals, ids.tolist(), strict=True)}
+        asked = set(map(tuple, voxels.tolist()))
         assert len(found) == len(ids) > 50
         assert found == {
             (*voxel, i)
             for i, place in PLACES.items()
             for voxel in blob(i, place).tolist()
-            if voxel in voxels.tolist()
+            if tuple(voxel) in asked
         }
 
     def test_nothing_asked_has_no_distances(self, band: Store) -> None:

@@ -28,8 +28,9 @@ def arch(n: int, inner: float = 4000.0, outer: float = 4300.0, deep: float = 500
     return [wedge.reshape(-1, 3, 3) for wedge in wedges]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("n", [25, 100, 301, 951])
+@pytest.mark.parametrize(
+    ("n", "seed"), [*((n, seed) for n in (25, 100) for seed in range(3)), (301, 1), (951, 2)]
+)
 def test_neighbours_in_an_arch_touch_and_no_others(n: int, seed: int) -> None:
     """In any frame, where shared corners stay equal; the gap of the others is the inner chord."""
     wedges = [placed(wedge, frame_of(seed)) for wedge in arch(n)]
@@ -55,9 +56,9 @@ def test_one_wedge_that_is_placed_many_times_touches_its_neighbour(n: int) -> No
         assert found.kind == "touching"
 
 
-def test_an_arch_of_951_objects_has_950_pairs_that_touch(tmp_path: Path) -> None:
-    surfaces = {f"wedge {i}": wedge for i, wedge in enumerate(arch(951))}
+def test_an_arch_of_301_objects_has_300_pairs_that_touch(tmp_path: Path) -> None:
+    surfaces = {f"wedge {i}": wedge for i, wedge in enumerate(arch(301))}
     with imported(tmp_path / "arch.db", surfaces) as env:
         found = find_clashes(env)
-        assert {kind: n for kind, n in found.counts().items() if n} == {"touching": 950}
+        assert {kind: n for kind, n in found.counts().items() if n} == {"touching": 300}
         assert {abs(one.a - one.b) for one in found.pairs} == {1}

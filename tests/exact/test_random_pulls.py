@@ -25,7 +25,7 @@ from hapticdb.exact.swept import Swept
 from random_pulls import Body, RandomPull, random_pull
 from winding import Surface, crossed, distances
 
-SOME, ALL, AT_ONCE = 100, 1000, 50
+SOME, ALL, AT_ONCE = 50, 1000, 50
 """Pulls of the quick test, of the long one, and those that share an environment."""
 FREE = {"clear", "slides", "overlaps"}
 SLACK = 0.002

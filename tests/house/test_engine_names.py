@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 
 from house.test_house import imported
-from sources import PACKAGE, modules
+from sources import PACKAGE, modules, tree
 
 DRIVERS = {"apsw", "sqlite3", "psycopg"}
 ASKS_OF_TEXT = {"startswith", "endswith", "partition", "removeprefix", "match", "search"}
@@ -18,16 +18,16 @@ def test_only_the_stores_know_their_engine() -> None:
     for path in modules():
         if path.is_relative_to(PACKAGE / "store"):
             continue
-        names = set(imported(path))
+        names = imported(path)
         assert not {name.split(".")[0] for name in names} & DRIVERS, path
         assert not {".".join(name.split(".")[:3]) for name in names} & folders, path
-        assert list(branches_on_engines(path.read_text())) == [], path
+        assert list(branches_on_engines(tree(path))) == [], path
 
 
-def branches_on_engines(source: str) -> Iterator[str]:
+def branches_on_engines(source: ast.Module) -> Iterator[str]:
     """Comparisons with an engine's name, and methods of `ASKS_OF_TEXT` called with one."""
     engine = re.compile("sqlite|postgres", re.IGNORECASE)
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(source):
         asked: list[ast.expr] = []
         if isinstance(node, ast.Compare):
             asked = [node.left, *node.comparators]

@@ -8,13 +8,14 @@ import shutil
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
 import hapticdb
 from children import finished
 from hapticdb.kernels._cache import sources_digest
-from sources import PACKAGE, ROOT, modules, named, python_files
+from sources import PACKAGE, ROOT, modules, named, python_files, tree
 
 # domains that may import less than their floor allows -> what they may import
 NARROW: dict[str, set[str]] = {
@@ -50,15 +51,17 @@ def drawn_floors() -> list[set[str]]:
 LEVELS = {name: level for level, floor in enumerate(drawn_floors()) for name in floor}
 
 
-def imported(path: Path) -> Iterator[str]:
+@cache
+def imported(path: Path) -> set[str]:
     """Dotted names of all that a source imports, at its top or inside a function."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    found: set[str] = set()
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{named(path)} imports relatively"
-            assert node.module is not None
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
 
 
 def own(path: Path) -> set[str]:
@@ -120,7 +123,7 @@ def test_kernels_and_terminals_and_benchmarks_are_kept_apart() -> None:
     """Kernels import numpy, numba with llvmlite, and their own folder; only cli/ draws."""
     benchmarks = {path.stem for path in (ROOT / "benchmarks").iterdir()} - {"__pycache__"}
     for path in modules():
-        names = set(imported(path))
+        names = imported(path)
         words = {name.split(".")[0] for name in names}
         assert not words & benchmarks, named(path)
         if domain(path) not in {"cli", "__main__"}:
@@ -181,12 +184,12 @@ WAITS_OF_OTHERS = {("table", "join")}
 RUNS = {"run", "call", "check_call", "check_output"}
 
 
-def endless_waits(source: str, *, is_test: bool) -> Iterator[tuple[int, str]]:
+def endless_waits(source: ast.Module, *, is_test: bool) -> Iterator[tuple[int, str]]:
     """Line number and text of each call and loop of a source that may wait for ever.
 
     Tests start processes only through the module `children`; benchmarks always give a timeout.
     """
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(source):
         if isinstance(node, ast.While) and _sleeps(node) and not _looks_at_clock(node):
             yield node.lineno, f"while {ast.unparse(node.test)}"
         if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
@@ -226,7 +229,7 @@ def test_nothing_is_waited_for_without_an_end() -> None:
     for path in python_files():
         folder = named(path).split("/")[0]
         if folder in {"tests", "benchmarks"} and named(path) not in allowed:
-            waits = endless_waits(path.read_text(), is_test=folder == "tests")
+            waits = endless_waits(tree(path), is_test=folder == "tests")
             found += [f"{named(path)}:{line}: {text}" for line, text in waits]
     assert found == []
 

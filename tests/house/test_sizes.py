@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 
-from sources import modules, named, python_files
+from sources import modules, named, python_files, tree
 
 
 def test_no_file_is_longer_than_500_lines() -> None:
@@ -17,9 +17,9 @@ MOST_LINES = 60
 """Longest function in lines, with signature and docstring."""
 
 
-def lengths(source: str) -> Iterator[tuple[str, int]]:
+def lengths(source: ast.Module) -> Iterator[tuple[str, int]]:
     """Name and lines of each function of a source."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(source):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             assert node.end_lineno is not None
             yield node.name, node.end_lineno - node.lineno + 1
@@ -29,7 +29,7 @@ def test_no_function_is_longer_than_60_lines() -> None:
     long = {
         f"{named(path)}:{name}": n_lines
         for path in modules()
-        for name, n_lines in lengths(path.read_text())
+        for name, n_lines in lengths(tree(path))
         if n_lines > MOST_LINES
     }
     assert long == {}
@@ -44,17 +44,16 @@ def test_no_folder_holds_more_than_15_files() -> None:
     assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
 
 
-def public_classes(source: str) -> list[str]:
+def public_classes(source: ast.Module) -> list[str]:
     """Names of the classes at the top of a source, private ones left out."""
-    body = ast.parse(source).body
-    names = [node.name for node in body if isinstance(node, ast.ClassDef)]
+    names = [node.name for node in source.body if isinstance(node, ast.ClassDef)]
     return [name for name in names if not name.startswith("_")]
 
 
 def test_a_public_class_name_stands_once() -> None:
     homes: dict[str, list[str]] = {}
     for path in modules():
-        for name in public_classes(path.read_text()):
+        for name in public_classes(tree(path)):
             homes.setdefault(name, []).append(named(path))
     assert {n: paths for n, paths in homes.items() if len(paths) > 1} == {}
 

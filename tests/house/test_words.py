@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from sources import PACKAGE, modules
+from sources import PACKAGE, modules, tree
 
 CLAUSE = re.compile(r"\b(?:that|which|what|where|whose|whoever|whatever)\b", re.IGNORECASE)
 VAGUE = re.compile(
@@ -22,9 +22,9 @@ LEAST_WORDS = 150
 """Words from which on a room is judged."""
 
 
-def prose_of(source: str) -> Iterator[str]:
+def prose_of(source: ast.Module) -> Iterator[str]:
     """Docstrings of a module, and the strings behind its constants, without names of code."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(source):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             is_function = not isinstance(node, ast.Module | ast.ClassDef)
             for one in node.body[: 1 if is_function else None]:
@@ -41,7 +41,7 @@ def room_of(path: Path) -> str:
 def test_rooms_are_described_by_nouns() -> None:
     texts: dict[str, list[str]] = defaultdict(list)
     for path in modules():
-        texts[room_of(path)] += prose_of(path.read_text())
+        texts[room_of(path)] += prose_of(tree(path))
     over = {}
     for room, some in texts.items():
         whole = " ".join(some)

@@ -30,6 +30,7 @@ def make(url: str, curve: CurveName = "z") -> Environment:
         ids = np.zeros(len(part.keys), dtype=np.int64)
         rows = Rows(part.keys, ids, part.occupancy, Band(*pack(part.values)))
         env.store.add(voxel_object(env.grid, part.voxels, f"part {n}"), rows)
+    env.store.save_costs(machine_name(), CostModel.of_equal_parts().figures())
     return env
 
 

@@ -15,6 +15,7 @@ import hapticdb
 from children import until
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
+from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from naive_frame import NaiveTouch, touch_of_shell
@@ -66,6 +67,7 @@ def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment
     env = hapticdb.create(url, Grid(SIZE, ORIGIN, BITS, curve), layout=layout)
     for n, voxels in enumerate(scene_voxels()):
         write_voxels(env.store, voxels, f"blob {n}")
+    env.store.save_costs(machine_name(), CostModel.of_equal_parts().figures())
     return env
 
 

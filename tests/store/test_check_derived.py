@@ -1,8 +1,8 @@
 """`hapticdb check` finds what is not what it derives from: each column, altered by itself."""
 
-from collections.abc import Callable, Iterator
+import contextlib
+from collections.abc import Iterator
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 
 import apsw
@@ -13,9 +13,10 @@ from psycopg import sql
 
 import hapticdb
 from assemblies import row_of_boxes
-from hapticdb.check import CheckReport, check_environment, repair_environment
+from hapticdb.check import check_environment, repair_environment
 from hapticdb.clashes.run import accept_clash, find_clashes
 from hapticdb.store.postgres.address import parse
+from postgres_servers import Binaries
 from servers import FOUND, named, url_on
 
 TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -48,6 +49,16 @@ ALTERED: dict[str, tuple[str, np.ndarray | None]] = {
     "a pair that is gone": ("DELETE FROM pair WHERE a = 1", None),
 }  # fmt: skip
 OF_PAIRS = list(ALTERED)[list(ALTERED).index("a") :]
+ON_SERVERS = ["transform", "bounds", "voxels", "rule", "kind", "no bound", "place", "because"]
+"""Columns of each type, which a server's rows are parsed from; what is compared is the same."""
+
+
+def on_engines(names: list[str]) -> pytest.MarkDecorator:
+    """Those columns on SQLite, some of them on the servers."""
+    found: list[tuple[Binaries | None, str]] = [(None, name) for name in names]
+    found += [(engine, name) for engine in FOUND for name in names if name in ON_SERVERS]
+    ids = [f"{named(engine)}-{name}" for engine, name in found]
+    return pytest.mark.parametrize(("engine", "name"), found, ids=ids)
 
 
 def searched(url: str | Path) -> None:
@@ -57,59 +68,60 @@ def searched(url: str | Path) -> None:
         accept_clash(env, [1], [2], "meant so")
 
 
-@pytest.fixture(params=[None, *FOUND], ids=named)
-def altered(
-    request: pytest.FixtureRequest, tmp_path: Path
-) -> Iterator[tuple[str, Callable[[str], CheckReport]]]:
-    """An environment on SQLite or a server, and what alters a column of it and checks it."""
-    path = row_of_boxes(tmp_path / "row.db", 3, 0.099)
-    with url_on(request.param, tmp_path) as url:
-        hapticdb.copy_environment(path, url)
+@pytest.fixture(scope="module")
+def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return row_of_boxes(tmp_path_factory.mktemp("row") / "row.db", 3, 0.099)
+
+
+@contextlib.contextmanager
+def altered(engine: Binaries | None, folder: Path, row: Path, name: str) -> Iterator[str]:
+    """URL of the row, searched, with a column altered."""
+    with url_on(engine, folder) as url:
+        hapticdb.copy_environment(row, url)
         searched(url)
-        yield url, partial(alter, url)
+        alter(url, name)
+        yield url
 
 
-def alter(url: str, name: str) -> CheckReport:
+def alter(url: str, name: str) -> None:
     statement, array = ALTERED[name]
     if "://" not in url:
         with closing(apsw.Connection(url)) as connection:
             connection.execute("PRAGMA ignore_check_constraints = ON")
             connection.execute(statement, () if array is None else (array.tobytes(),))
-        return check_environment(url)
+        return
     address = parse(url)
     with psycopg.connect(address.conninfo, autocommit=True) as server:
         schema = sql.Identifier(address.environment)
         server.execute(sql.SQL("SET search_path = {}").format(schema))
         given = () if array is None else (array.ravel().tolist(),)
         server.execute(statement.replace("?", "%s").encode(), given)
-    return check_environment(url)
 
 
-@pytest.mark.parametrize("name", ALTERED)
+@on_engines(list(ALTERED))
 def test_an_altered_column_is_found(
-    altered: tuple[str, Callable[[str], CheckReport]], name: str
+    tmp_path: Path, row: Path, engine: Binaries | None, name: str
 ) -> None:
-    url, alter_it = altered
-    assert check_environment(url).findings == []
-    report = alter_it(name)
-    assert not report.is_sound
-    assert all("\n" not in finding for finding in report.findings)
+    with altered(engine, tmp_path, row, name) as url:
+        report = check_environment(url)
+        assert not report.is_sound
+        assert all("\n" not in finding for finding in report.findings)
 
 
-@pytest.mark.parametrize("name", ["bounds", *OF_PAIRS])
+@on_engines(["bounds", *OF_PAIRS])
 def test_repair_mends_what_can_be_made_anew(
-    altered: tuple[str, Callable[[str], CheckReport]], name: str
+    tmp_path: Path, row: Path, engine: Binaries | None, name: str
 ) -> None:
     """Pairs, by the next search; the accepted pair stays accepted where its row is there."""
-    url, alter_it = altered
-    repair_environment(url, alter_it(name))
-    with hapticdb.open(url) as env:
-        found = find_clashes(env)
-    assert check_environment(url).findings == []
-    assert found.counts()["overlapping"] == 2
-    lost = {"a", "b", "pair's revision", "because", "a pair that is gone"}
-    if name not in lost:
-        assert [one.because for one in found.pairs if one.a == 1] == ["meant so"]
+    with altered(engine, tmp_path, row, name) as url:
+        repair_environment(url, check_environment(url))
+        with hapticdb.open(url) as env:
+            found = find_clashes(env)
+        assert check_environment(url).findings == []
+        assert found.counts()["overlapping"] == 2
+        lost = {"a", "b", "pair's revision", "because", "a pair that is gone"}
+        if name not in lost:
+            assert [one.because for one in found.pairs if one.a == 1] == ["meant so"]
 
 
 def test_moved_and_removed_objects_leave_a_sound_environment(tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def outcome(path: Path, content: bytes, log: bytes = b"") -> tuple[bool, str]:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "cases",
-    [16, pytest.param(1000 if is_every() else 200, marks=pytest.mark.long)],
+    [8, pytest.param(1000 if is_every() else 200, marks=pytest.mark.long)],
     ids=["short", "long"],
 )
 def test_check_finds_all_damage_of_rows(

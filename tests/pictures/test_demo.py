@@ -15,10 +15,12 @@ from hapticdb.cli import main
 from hapticdb.errors import UsageError
 from hapticdb.pictures import demo as demo_picture
 
+FRAMES = 25
+
 
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> demo.DemoScene:
-    return demo.prepare(tmp_path_factory.mktemp("demo"), bits=7, frames=60, points=120)
+    return demo.prepare(tmp_path_factory.mktemp("demo"), bits=7, frames=FRAMES, points=120)
 
 
 @pytest.fixture(scope="session")
@@ -33,13 +35,13 @@ def comparison(scene: demo.DemoScene) -> demo.Comparison:
 
 def test_every_strategy_agrees_on_both_layouts(comparison: demo.Comparison) -> None:
     assert comparison.disagreed == ()
-    assert comparison.compared == 60 * len(demo.COMPARED) * 2
+    assert comparison.compared == FRAMES * len(demo.COMPARED) * 2
     assert comparison.verdict.startswith("all agreed")
     layouts = [measured.imported.layout for measured in comparison.layouts]
     assert layouts == ["brick", "voxel"]
     for measured in comparison.layouts:
         assert tuple(measured.felt) == demo.COMPARED
-        assert all(len(queries) == 60 for queries in measured.felt.values())
+        assert all(len(queries) == FRAMES for queries in measured.felt.values())
     assert len({measured.imported.voxels for measured in comparison.layouts}) == 1
 
 

@@ -3,6 +3,7 @@
 # ruff: noqa: S314 - files of our own
 import io
 import re
+import shutil
 from pathlib import Path
 from uuid import UUID
 from xml.etree import ElementTree as ET
@@ -22,16 +23,21 @@ from hapticdb.verdicts import Kind
 from ifc_files import Building
 
 
-@pytest.fixture
-def hall(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two walls 0.1 m deep in one another, and a column that touches the second."""
+    folder = tmp_path_factory.mktemp("hall")
     one = Building()
     for name, at in (("wall", 0.0), ("crossing", 1.9)):
         one.add("IfcWall", name, one.shape(one.box(2000, 200, 2500)), (at, 0.0, 3.0))
     one.add("IfcColumn", "post \x01", one.shape(one.box(200, 200, 2500)), (3.0, 0.0, 3.0))
-    url = tmp_path / "hall.db"
-    hapticdb.import_files(url, [one.written(tmp_path / "hall.ifc")])
-    return url
+    hapticdb.import_files(folder / "hall.db", [one.written(folder / "hall.ifc")])
+    return folder / "hall.db"
+
+
+@pytest.fixture
+def hall(built: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(built, tmp_path))
 
 
 def outcomes(report: Path) -> dict[str, list[str]]:

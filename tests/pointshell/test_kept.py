@@ -30,6 +30,11 @@ def ball(path: Path, *, is_open: bool = False) -> Path:
     return path
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _files_are_parsed_here() -> None:
+    """The child that parses a tool has searched the names in it, and no others."""
+
+
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A tool, in a folder where the cache is empty."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from hapticdb import Grid
 from hapticdb.mesh import packing
+from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.store import SQLiteStore
 from voxels import floor_voxels, write_voxels
@@ -91,6 +92,7 @@ def made(path: Path, layout: Layout) -> Path:
         store.analyze(10_000)
         store.analyze(10)
         store.save_costs("elsewhere", {"row": 1.0})
+        store.save_costs(machine_name(), CostModel.of_equal_parts().figures())
     return path
 
 

@@ -6,6 +6,7 @@ import pytest
 from contact_scenes import (
     CONTACT,
     MEETINGS,
+    MM,
     Floats,
     Meeting,
     box,
@@ -16,6 +17,8 @@ from contact_scenes import (
     placed,
     sheet,
 )
+from hapticdb.exact.clash import judge
+from hapticdb.pointshell.shape import CollisionShape
 
 FRAMES = (0, 1, 2)
 SCENES = {one.name: one for one in MEETINGS}
@@ -42,12 +45,34 @@ def test_kind_and_depth_of_a_pair(name: str, seed: int) -> None:
     check(one, b, a)
 
 
-@pytest.mark.parametrize("name", [one.name for one in MEETINGS if one.name != "part in a void"])
+@pytest.mark.parametrize("name", [one.name for one in MEETINGS if "void" not in one.name])
 def test_winding_does_not_matter(name: str) -> None:
     """Files hold bodies inside out; a void beside its body is told by its winding alone."""
     one = SCENES[name]
     check(one, inverted(one.a), one.b)
     check(one, one.a, inverted(one.b))
+
+
+@pytest.mark.parametrize("gap", [1e-6, 0.02, 0.3, 0.99, 1.1])
+def test_a_gap_is_told_to_a_millionth_of_a_millimetre(gap: float) -> None:
+    found = judged(box((4, 4, 4)), box((4, 4, 4), (4.0 + gap, 1.0, 0.5)))
+    assert found.kind == ("touching" if gap < CONTACT else "apart" if gap < 1.0 else "far")
+    if found.kind != "far":
+        assert [found.at_least, found.at_most] == pytest.approx([gap, gap], abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", FRAMES)
+def test_the_deepest_place_of_equal_shapes_is_in_both(seed: int) -> None:
+    """One shape twice, and two equal ones."""
+    one, same = (CollisionShape(MM * box((100, 20, 20))) for _ in range(2))
+    pose = frame_of(seed)
+    pose[:3, 3] = MM * np.array([30.0, 8.0, 5.0])
+    found, apart = (judge(one, other, pose, MM, MM * CONTACT) for other in (one, same))
+    assert found.kind == "overlapping"
+    np.testing.assert_array_equal(found.on_a, apart.on_a)
+    half = MM * np.array([50.0, 10.0, 10.0]) + 1e-9
+    assert (np.abs(found.on_a) <= half).all()
+    assert (np.abs(pose[:3, :3].T @ (found.on_a - pose[:3, 3])) <= half).all()
 
 
 RIB = (20.0, (0.0, 0.0, 2.0))

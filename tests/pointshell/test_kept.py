@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -100,23 +101,16 @@ def test_a_kept_tool_has_the_bits_of_a_fresh_one(
             assert one == other, field.name
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"points": 51},
-        {"unit": "mm"},
-        {"unit": "m"},
-        {"seed": 1},
-        {"inset": np.nextafter(INSET, 1.0)},
-    ],
-)
-def test_another_request_is_another_entry(
-    file: Path, is_read: Callable[[], bool], change: dict[str, float]
-) -> None:
+def test_another_request_is_another_entry(file: Path, is_read: Callable[[], bool]) -> None:
     tool(file)
-    tool(file, **change)  # type: ignore[arg-type]
     assert is_read()
-    assert len(entries()) == 2
+    changes: list[dict[str, Any]] = [
+        {"points": 51}, {"unit": "ft"}, {"unit": "m"}, {"seed": 1},
+        {"inset": np.nextafter(INSET, 1.0)},
+    ]  # fmt: skip
+    for n, change in enumerate(changes, start=2):
+        tool(file, **change)
+        assert (is_read(), len(entries())) == (True, n), change
 
 
 def test_an_edit_of_the_file_or_of_the_sources_makes_the_tool_anew(
@@ -136,25 +130,20 @@ def test_an_edit_of_the_file_or_of_the_sources_makes_the_tool_anew(
     assert is_read()
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
+def test_a_damaged_entry_is_made_anew(file: Path, is_read: Callable[[], bool]) -> None:
+    before = tool(file)
+    damages: list[Callable[[Path], object]] = [
         lambda entry: entry.write_bytes(b""),
         lambda entry: entry.write_bytes(entry.read_bytes()[:-8]),
         lambda entry: entry.write_bytes(entry.read_bytes()[:-1] + b"!"),
         lambda entry: (entry.unlink(), entry.mkdir()),
-    ],
-    ids=["empty", "cut", "flipped", "a folder"],
-)
-def test_a_damaged_entry_is_made_anew(
-    file: Path, is_read: Callable[[], bool], damage: Callable[[Path], object]
-) -> None:
-    before = tool(file)
-    (entry,) = entries()
-    damage(entry)
-    is_read()
-    assert tool(file).shell.points.tobytes() == before.shell.points.tobytes()
-    assert is_read()
+    ]
+    for n, damage in enumerate(damages):
+        (entry,) = entries()
+        damage(entry)
+        is_read()
+        assert tool(file).shell.points.tobytes() == before.shell.points.tobytes()
+        assert is_read(), n
 
 
 def test_files_that_the_tool_refers_to_are_looked_at(

@@ -243,6 +243,6 @@ def test_bad_places_are_one_line(run: Run, path: Path, tmp_path: Path) -> None:
     refused(run("backup", path, tmp_path / "no" / "copy.db"), "does not exist")
     refused(run("backup", tmp_path / "no.db", "copy.db"), "no environment at")
     server = "postgresql://me:secret@host/plant"
-    assert "secret" not in refused(run("backup", server, "copy.db"), "hapticdb copy")
+    assert "secret" not in refused(run("backup", server, "copy.db"), "PostgreSQL", "hapticdb copy")
     refused(run("backup", path, server), "not a file")
     assert files(tmp_path) == before

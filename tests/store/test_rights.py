@@ -303,7 +303,7 @@ def test_grant_speaks_one_line(run: Run, url: str, roles: dict[Right, str]) -> N
     refused(run("grant", url, "nobody at all", "--as", "viewer"), "createuser")
     refused(run("grant", url, roles["viewer"]), "--as")
     refused(run("grant", url, roles["viewer"], "--as", "owner"), "viewer")
-    refused(run("grant", "a.db", "anna", "--as", "viewer"), "file system")
+    refused(run("grant", "a.db", "anna", "--as", "viewer"), "SQLite, which has no roles")
 
 
 MARK = "Zq7"

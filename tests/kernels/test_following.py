@@ -26,9 +26,9 @@ class Followed:
         for pose in (self.hand.quaternion, self.slot.segment.start[3:], self.slot.segment.end[3:]):
             pose[0] = 1.0
 
-    def arrive(self, now: int, x: float, *, is_held: bool = True, turn: float = 0.0) -> None:
+    def arrive(self, now: int, x: float, *, turn: float = 0.0) -> None:
         self.slot.hand_pose[:] = (x, 0.0, 0.0, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
-        self.slot.hand_time, self.slot.is_held = now, is_held
+        self.slot.hand_time = now
         self.slot.hand_sequence += 2
 
     def at(self, now: int) -> float:
@@ -72,14 +72,6 @@ def test_a_hand_has_no_jumps_and_never_goes_beyond_what_arrived(
             last, now = place, now + 1
     delay = round(STRETCH * LONGEST_GAP_NS / MS)
     assert hand.at((now + delay) * MS) == pytest.approx(x, abs=1e-12)
-
-
-def test_a_hand_that_let_go_is_nowhere_and_takes_the_tool_again_where_it_is_then() -> None:
-    hand = Followed(gap_ms=40.0)
-    hand.arrive(1000 * MS, 0.01, is_held=False)
-    assert math.isnan(hand.at(1000 * MS))
-    hand.arrive(2000 * MS, 0.5)
-    assert hand.at(2000 * MS) == 0.5
 
 
 def test_a_pose_that_is_being_written_is_taken_later() -> None:

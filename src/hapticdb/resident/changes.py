@@ -68,13 +68,9 @@ def known_cells_touched(
 class LeftOutObjects:
     """Ids of the objects outside of a filter, at the last followed revision.
 
-    Attributes
-    ----------
-    felt : Filter
-        Its words are read again when an object is added or removed, or has another name or other
-        attributes. A word that chooses nothing any more chooses nothing.
-    ids : (E,) int64
-        Ascending and distinct.
+    felt : its words are read again when an object is added or removed, or has another name or other
+    attributes; a word that chooses nothing any more chooses nothing. ids (E,) : ascending and
+    distinct.
     """
 
     def __init__(self, felt: Filter) -> None:

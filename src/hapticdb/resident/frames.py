@@ -93,21 +93,8 @@ def _surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Su
 class ResidentFrames:
     """Frames of one shell. Each frame waits until its cells are resident, so all are exact.
 
-    Parameters
-    ----------
-    residency : Residency
-        Residency of the environment; its table may have other readers.
-    shell : PointShell
-        The tool.
-    law : ForceLaw or None
-        Force law; the tangent plane with 1000 N/m unless given.
-    run : int or None
-        As for `clusters_of`.
-
-    Raises
-    ------
-    UsageError
-        If the law reads distances, and the cells have none.
+    law : the tangent plane with 1000 N/m unless given; run : as for `clusters_of`. Raises
+    UsageError if the law reads distances, and the cells have none.
     """
 
     def __init__(
@@ -142,13 +129,7 @@ class ResidentFrames:
         self.residency.table.leave(self._row)
 
     def feel(self, poses: ArrayLike) -> FeltFrames:
-        """Fetch the cells for poses (M, 4, 4) `world_from_tool`, and compute the wrenches there.
-
-        Raises
-        ------
-        UsageError
-            If a pose is not rigid.
-        """
+        """Fetch the cells for rigid poses (M, 4, 4) `world_from_tool`; compute wrenches there."""
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros(len(matrices), RESULT)
         done = 0

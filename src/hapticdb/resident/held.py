@@ -18,15 +18,10 @@ Floats = NDArray[np.float64]
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
     """Prepare a shell for frames: points with normals, and bounding spheres of clusters.
 
-    Parameters
-    ----------
-    shell : PointShell
-        Its points may have any order. Clusters skip most points if neighbours by index are
-        neighbours in space, as in shells made from files.
-    voxel_size : float
-        Metres. A sphere is larger by a thousandth of a voxel, which is more than rounding errors.
-    run : int or None
-        Points of a cluster, 0 for no clusters; 64 unless given, 0 for small shells.
+    The points may have any order; clusters skip most points if neighbours by index are neighbours
+    in space, as in shells made from files. A sphere is larger by a thousandth of a voxel (m), more
+    than rounding errors. run : points of a cluster, 0 for no clusters; 64 unless given, 0 for small
+    shells.
     """
     if run is None:
         run = RUN if len(shell) > RUN else 0

@@ -31,27 +31,10 @@ class CellMirror:
     It has as many slots as the table, so evicted cells leave the GPU, too, and unknown cells are
     unknown there. The table's writer may use it, and a reader within a frame.
 
-    Parameters
-    ----------
-    table : CellTable
-        The table.
-    law : NamedTuple
-        Law of the frames that read it, in the kernels' form.
-    side : int or None
-        Voxels of the grid on each axis; None: for the queries of a hand, with directory,
-        masks and payload alone.
-
-    Attributes
-    ----------
-    arrays : tuple
-        keys, slots, words, gate and payload, as `kernels.gpu.frames.frames_under` takes them.
-    n_copied : int
-        Number of slots copied so far.
-
-    Raises
-    ------
-    UsageError
-        If the table is larger than the GPU's free memory.
+    law : of the frames that read it, in the kernels' form; side : voxels of the grid on each axis,
+    None for the queries of a hand, with directory, masks and payload alone. arrays : keys, slots,
+    words, gate and payload, as `kernels.gpu.frames.frames_under` takes them; n_copied : slots
+    copied so far. Raises UsageError if the table is larger than the GPU's free memory.
     """
 
     def __init__(self, table: CellTable, law: object, side: int | None) -> None:

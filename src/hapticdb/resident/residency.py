@@ -80,33 +80,14 @@ class Residency:
 
     It chooses cells and times of reads. `CellSource` reads; `CellWriter` writes the table.
 
-    Parameters
-    ----------
-    store : Store
-        A connection of its own; `reopened` replaces it.
-    table : CellTable
-        A table without another writer. If an earlier writer has filled it and has ended, the urgent
-        cells are read again and all others are forgotten, in one version.
-    exclude, where : iterable of int or str
-        Filter of the objects: see `hapticdb.store.filtering.Filter`. The words are read again as
-        others write; a word without an object is no error.
-    urgent : (n,) int64
-        Cells near tools, distinct, most urgent first.
-    clock : callable
-        Returns seconds, to time loads.
+    store : a connection of its own; `reopened` replaces it; table : without another writer. If an
+    earlier writer has filled it and has ended, the cells `urgent` (n,), near tools, distinct, most
+    urgent first, are read again and all others are forgotten, in one version. exclude, where : as
+    of `hapticdb.store.filtering.Filter`; the words are read again as others write, and a word
+    without an object is no error. clock : returns seconds, to time loads.
 
-    Attributes
-    ----------
-    writer : CellWriter
-        Writer of the table's cells.
-    n_loaded : int
-        Cells fetched so far.
-
-    Raises
-    ------
-    UsageError
-        If the environment's curve has no cells. If the table has distances and an object of the
-        filter has none; also later, after a write of others.
+    Raises UsageError if the environment's curve has no cells, or the table has distances and an
+    object of the filter has none; also later, after a write of others.
     """
 
     def __init__(
@@ -149,12 +130,8 @@ class Residency:
     def reopened(self, store: Store) -> None:
         """Continue with a new connection to the environment, after the old one was lost.
 
-        If it is now another environment with the same grid, all cells become unknown.
-
-        Raises
-        ------
-        GridError
-            If the environment was replaced by one with another grid.
+        If it is now another environment with the same grid, all cells become unknown; with another
+        grid a GridError is raised.
         """
         if store.grid != self.grid:
             raise GridError(
@@ -216,10 +193,7 @@ class Residency:
     def make_resident(self, cells: Keys) -> None:
         """Make all cells (n,) resident at the same time, by as many statements as necessary.
 
-        Raises
-        ------
-        UsageError
-            If they do not fit into the table together.
+        Raises UsageError if they do not fit into the table together.
         """
         self.begin_round()
         missing = self.missing(cells)

@@ -44,16 +44,9 @@ class CellSource:
     The cells of a batch are grouped into ranges by cost, as in the strategy `cbgroup`: a gap is
     scanned if this costs no more than another descent of the index on this database.
 
-    Parameters
-    ----------
-    store : Store
-        A connection; it may be replaced by another one to the same environment.
-    exclude : (E,) int64
-        Ids of the excluded objects, ascending; it may be replaced, too.
-    clock : callable
-        Returns seconds, to time round trips at the start.
-    may_measure : bool
-        Whether there is time at the start to measure the cost of statements.
+    store, exclude : a connection, and ids (E,) of the excluded objects, ascending; others may take
+    their places; clock : returns seconds, to time round trips at the start; may_measure : there is
+    time at the start to measure the cost of statements.
     """
 
     def __init__(
@@ -105,10 +98,7 @@ class CellSource:
     ) -> None:
         """Write the distances of rows into the slots (R,) of their cells.
 
-        Raises
-        ------
-        DatabaseError
-            If packed distances are damaged.
+        Raises DatabaseError if packed distances are damaged.
         """
         grid, slot = self.store.grid, -1
         for at in range(0, len(rows), ROWS_AT_ONCE):

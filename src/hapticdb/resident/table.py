@@ -92,14 +92,9 @@ def _capacity(n_slots: int) -> int:
 
 
 def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
-    """Number of slots within a budget, with the slot for empty cells.
+    """Number of slots within a budget, with the slot for empty cells: at least `LEAST_BUDGET`.
 
     A slot with distances takes 47 KiB, one without them 4 KiB.
-
-    Raises
-    ------
-    UsageError
-        If the budget is below `LEAST_BUDGET`.
     """
     if budget_bytes < LEAST_BUDGET:
         raise UsageError(
@@ -116,28 +111,10 @@ def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
 class CellTable(Closes):
     """A table of cells in shared memory.
 
-    Parameters
-    ----------
-    descriptor : int
-        File descriptor of the memory from `create`, in any process. The table owns it and closes
-        it.
-    n_slots : int
-        Number of its slots.
-
-    Attributes
-    ----------
-    cells : Cells
-        The arrays that frames read; see `hapticdb.kernels.resident.cells`.
-    queue : RequestQueue
-        Messages between sessions and the prefetch process.
-    filled : (slots,) int64
-        Version of the directory in which each slot's cell appeared, for copies of the table.
-    descriptor : int
-        File descriptor of the memory, for a process to inherit.
-    has_distances : bool
-        Whether the cells have distances to surfaces.
-    size_bytes : int
-        Size of the memory: never more than the budget.
+    descriptor : of the memory from `create`, in any process, owned from now on. cells : the arrays
+    that frames read; queue : messages between sessions and the prefetch process; filled (slots,) :
+    version of the directory in which each slot's cell appeared, for copies of the table; size_bytes
+    : never more than the budget.
     """
 
     def __init__(self, descriptor: int, n_slots: int) -> None:
@@ -208,13 +185,7 @@ class CellTable(Closes):
         return int(self.cells.control["revisions"][self.version % BUFFERS])
 
     def join(self) -> int:
-        """Become a reader; returns its row.
-
-        Raises
-        ------
-        UsageError
-            If the table has no free reader row.
-        """
+        """Become a reader; returns its row, or UsageError if none is free."""
         with _joining:
             free = np.flatnonzero(self.queue.pids == 0)
             if len(free):

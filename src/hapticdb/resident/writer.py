@@ -32,12 +32,8 @@ returning tool finds its cells; in a small table fewer cells are left to evict."
 class CellSlots:
     """Slots of one table: free, filled, or retired until no frame can see them.
 
-    Slot `EMPTY_SLOT` belongs to no cell: it represents all empty cells.
-
-    Attributes
-    ----------
-    n_filled : int
-        Number of slots with a cell in the directory.
+    Slot `EMPTY_SLOT` belongs to no cell: it represents all empty cells. n_filled : slots with a
+    cell in the directory.
     """
 
     def __init__(self, table: CellTable) -> None:
@@ -162,17 +158,7 @@ class UnpublishedCells(NamedTuple):
 class CellWriter:
     """The only writer of a table's cells.
 
-    Parameters
-    ----------
-    table : CellTable
-        The table; it has no other writer.
-
-    Attributes
-    ----------
-    slots : CellSlots
-        Cells with voxels or distances.
-    n_evicted : int
-        Number of cells evicted so far.
+    slots : of cells with voxels or distances; n_evicted : cells evicted so far.
     """
 
     def __init__(self, table: CellTable) -> None:

@@ -36,13 +36,7 @@ def limit_text(newtons: float, cap: float) -> str:
 
 
 def rendering_of(rendering: Rendering | None, law: ForceLaw) -> Rendering:
-    """Rendering of a session under a law; by default coupled if the law reads distances.
-
-    Raises
-    ------
-    UsageError
-        If there is no such rendering, or the coupling's contacts have no distances.
-    """
+    """Rendering of a session under a law; by default coupled if the law reads distances."""
     if rendering is None:
         return "coupled" if reads_distances(law) else "direct"
     if rendering not in RENDERINGS:
@@ -190,18 +184,8 @@ class DirectRendering:
     This is the loop of the paper (section 4, Figure 4). The wrench of each frame goes to the
     device, up to its caps; nothing keeps the tool out of surfaces.
 
-    Attributes
-    ----------
-    profile : str
-        Name of the device's profile.
-    cap, torque_cap : float
-        Greatest force, N, and greatest torque about the tool's centre, N m, at the device.
-    scale : float
-        S, metres of the scene for one metre of the device.
-    radius : float
-        Distance of the tool's farthest point from its centre, metres of the scene.
-    hold, fade : float
-        See `HOLD`.
+    profile : name of the device's; cap, torque_cap : greatest force, N, and torque about the tool's
+    centre, N m, at the device; scale, radius : as for `Coupling.of_session`; hold, fade : `HOLD`.
     """
 
     profile: str
@@ -222,14 +206,8 @@ class DirectRendering:
 class SettledCoupling(DirectRendering):
     """A `Coupling` of one session: every number is settled. A recording has these.
 
-    Attributes
-    ----------
-    stiffness, asked_stiffness : float
-        K, N/m at the device, and the one that was asked for.
-    lowered : str or None
-        One line: what lowered the stiffness; None if nothing did.
-    turn_stiffness, damping, delay : float
-        As for `Coupling`.
+    asked_stiffness : before it was lowered, N/m at the device; lowered : one line on what lowered
+    it, None if nothing did; others as for `Coupling`.
     """
 
     stiffness: float

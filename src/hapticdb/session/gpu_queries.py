@@ -93,17 +93,8 @@ class _Repeated:
 class GpuQueries:
     """Proximity queries of one coupling on the GPU: same near points, in the same order.
 
-    Parameters
-    ----------
-    state : SessionState
-        Of a tool whose periods this process runs; from now on the GPU answers its queries.
-    table : CellTable
-        Cells of the session.
-
-    Attributes
-    ----------
-    card : str
-        Name of the GPU.
+    state : of a tool whose periods this process runs, with cells of `table`; from now on the GPU
+    answers its queries. card : name of the GPU.
     """
 
     def __init__(self, state: SessionState, table: CellTable) -> None:

@@ -128,7 +128,6 @@ class SessionHost(Closes):
             running.worker = worker
             hand = np.array(row_of_pose(pose))
             self._shared.slots["hand_pose"][running.slot] = hand
-            self._shared.slots["is_held"][running.slot] = 1
             table = cells.table
             worker.ask(
                 "begin", running.request, hand, id(cells), table.n_slots,

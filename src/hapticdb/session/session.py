@@ -285,12 +285,17 @@ class Session(Closes):
 
     def _reported(self, answer: LoopAnswer) -> Report:
         recorded = self._open.stop_recording()
+        conditions = {"points": str(len(self.shell))}
+        if self.timing.processor is not None:
+            conditions["processor"] = f"bound to processor {self.timing.processor}"
+        if answer.card is not None:
+            conditions["frames on"] = answer.card
         return Report(
             rate=self.timing.rate,
             loop=answer.loop,
             empty=answer.empty,
             bad_reading=answer.bad_reading,
-            conditions=self._conditions() | ({"frames on": answer.card} if answer.card else {}),
+            conditions=conditions,
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,
@@ -304,13 +309,6 @@ class Session(Closes):
             coupling=self.coupling,
             **counts_of(self._open.shared.slots[0]),
         )
-
-    def _conditions(self) -> dict[str, str]:
-        """Tool and processor, for the report."""
-        points, processor = {"points": str(len(self.shell))}, self.timing.processor
-        if processor is None:
-            return points
-        return points | {"processor": f"bound to processor {processor}"}
 
     def close(self) -> None:
         """End the processes and close the recording; its file stays.

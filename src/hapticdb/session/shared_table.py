@@ -104,9 +104,7 @@ class SharedTable(Closes):
         slots = self.slots
         slots["hand_sequence"][row] += 1
         slots["hand_pose"][row] = pose
-        slots["n_moves"][row] += 1
         slots["hand_time"][row] = time
-        slots["is_held"][row] = 1
         slots["hand_sequence"][row] += 1
 
     def last_frame(self, row: int) -> Frames | None:

@@ -20,20 +20,7 @@ _PR_GET_TIMERSLACK = 30
 
 @dataclass(frozen=True)
 class Timing:
-    """How a loop is scheduled.
-
-    Attributes
-    ----------
-    rate : float
-        Frames a second, 10 to 20,000.
-    processor : int or None
-        Number of the processor that the loop is bound to.
-
-    Raises
-    ------
-    UsageError
-        If the rate is out of its range, or this process may not run on that processor.
-    """
+    """How a loop is scheduled: frames a second, 10 to 20,000; processor that it is bound to."""
 
     rate: float = 1000.0
     processor: int | None = None

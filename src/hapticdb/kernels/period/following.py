@@ -28,8 +28,7 @@ def _take_arrival(slot, hand, now):
     if sequence == slot.seen or sequence & 1:
         return
     fence()
-    arrived, is_held = slot.hand_time, slot.is_held
-    pose, segment = slot.hand_pose, slot.segment
+    arrived, pose, segment = slot.hand_time, slot.hand_pose, slot.segment
     for n in range(7):
         segment.arriving[n] = pose[n]
     fence()
@@ -39,29 +38,20 @@ def _take_arrival(slot, hand, now):
     slot.arrived, slot.seen = arrived, sequence
     if 0 < gap < SILENCE_NS:
         slot.gap += (min(gap, LONGEST_GAP_NS) - slot.gap) // 2
-    if not is_held:
-        slot.is_let_go = 1
-        return
-    # after a release the hand starts at the pose of its arrival, without a segment
-    is_new = slot.is_let_go != 0
     for n in range(3):
-        segment.start[n] = segment.arriving[n] if is_new else hand.position[n]
-        segment.end[n] = segment.arriving[n]
+        segment.start[n] = hand.position[n]
     for n in range(4):
-        segment.start[3 + n] = segment.arriving[3 + n] if is_new else hand.quaternion[n]
-        segment.end[3 + n] = segment.arriving[3 + n]
-    slot.is_let_go = 0
+        segment.start[3 + n] = hand.quaternion[n]
+    for n in range(7):
+        segment.end[n] = segment.arriving[n]
     segment.began, segment.seconds = now, STRETCH * 1e-9 * slot.gap
 
 
 @leaf
 def follow_arrivals(slot, hand, now):
-    """Write the hand's pose and velocity at a time, ns; position NaN while the hand is released."""
+    """Write the hand's pose and velocity at a time, ns."""
     _take_arrival(slot, hand, now)
     position, turned, velocity = hand.position, hand.quaternion, hand.velocity
-    if slot.is_let_go:
-        position[0] = math.nan
-        return
     segment = slot.segment
     start, end = segment.start, segment.end
     passed = 1e-9 * (now - segment.began)

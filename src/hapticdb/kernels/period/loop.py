@@ -225,7 +225,7 @@ def _run_period(slot, ring, clock):
     if begun - slot.requested_at >= TELL_EVERY_NS or sent.unknown > 0 or not slot.is_frame:
         slot.requested_at = begun
         tell(
-            request, hand, slot.is_let_go, memory.pose, shell.center, spring_of(slot).radius,
+            request, hand, memory.pose, shell.center, spring_of(slot).radius,
             memory.missed[0],
         )  # fmt: skip
     if not slot.is_frame:

@@ -21,7 +21,7 @@ HELD, FADING, CLUTCH_OPEN, IN_OBJECT, STALE, ANEW = 1, 2, 4, 8, 16, 32
 
 
 @leaf
-def tell(request, hand, is_let_go, pose, center, radius, missed):
+def tell(request, hand, pose, center, radius, missed):
     """Write a prefetch request: tool, hand and the unknown cells of the last query.
 
     request : a REQUEST, a seqlock: its sequence number is odd during a write; pose (4, 4), center
@@ -34,13 +34,10 @@ def tell(request, hand, is_let_go, pose, center, radius, missed):
     told.is_active = True
     told.tool[0], told.tool[1], told.tool[2] = x, y, z
     told.radius = radius
-    if not is_let_go:  # else the request covers the tool's surroundings alone
-        rx, ry, rz = turned(transform, center[0], center[1], center[2])
-        at = hand.position
-        x, y, z = at[0] + rx, at[1] + ry, at[2] + rz
-    told.handle[0], told.handle[1], told.handle[2] = x, y, z
+    lever = turned(transform, center[0], center[1], center[2])
     for axis in range(3):
-        told.velocity[axis] = 0.0 if is_let_go else hand.velocity[axis]
+        told.handle[axis] = hand.position[axis] + lever[axis]
+        told.velocity[axis] = hand.velocity[axis]
     request.missed.n_cells = missed.n_cells
     for n in range(missed.n_cells):
         request.missed.cells[n] = missed.cells[n]

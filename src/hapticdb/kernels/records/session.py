@@ -29,7 +29,7 @@ SEGMENT: Layout = record(
 SLOT: Layout = record(
     [
         *_integers("state id is_asked_to_end worker"),
-        *_integers("hand_sequence hand_time is_held n_moves"),
+        *_integers("hand_sequence hand_time"),
         ("hand_pose", "<f8", 7),
         *_integers("source is_frame reader request staleness bits curve"),
         ("place", "<f8", 5),
@@ -50,7 +50,7 @@ SLOT: Layout = record(
         ("handle", HANDLE),
         ("reading", READING),
         *_integers("reads pushes"),
-        *_integers("seen arrived gap is_let_go"),
+        *_integers("seen arrived gap"),
         ("segment", SEGMENT),
         ("servo", SERVO),
         ("follower", FOLLOWER),
@@ -76,10 +76,9 @@ field                                   meaning, unit, frame                    
 state, id                               of `session.shared_table`; session's number     O   C W
 is_asked_to_end                         end after the present frame                     O   W
 worker                                  whose loop runs it, from 1; 0: none             W   O W
-hand_sequence, n_moves                  odd during a write; poses so far                C   W C
+hand_sequence                           odd during a write                              C   W C
 hand_time                               ns                                              C   W
 hand_pose                               m and unit quaternion, scalar first, world      C   W
-is_held                                 the tool is dragged                             C   W
 source, is_frame                        of `period.loop`; periods are recorded          W   W
 reader, request                         row of cells; address of its `REQUEST`          W   W
 staleness                               ns of silence until all cells are unknown       W   W
@@ -91,7 +90,6 @@ springs, spring, used_spring            `DeviceSpring`; row of the next, this pe
 handle, reading                         of a device, its own frame and units            W   W
 reads, pushes                           addresses of its callbacks; 0: by the caller    W   W
 seen, arrived, gap                      last arrival: sequence, ns; ns between two      W   W
-is_let_go                               no hand                                         W   W
 segment.arriving, start, end            poses, m and unit quaternion, world             W   W
 segment.began, seconds                  ns; s                                           W   W
 servo, follower                         tool, handle, wrench; coupling                  W   W

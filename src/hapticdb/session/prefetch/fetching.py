@@ -73,19 +73,8 @@ class FetchRequest:
 class Fetcher:
     """Fills a table with the cells of sessions, round by round.
 
-    Parameters
-    ----------
-    request : FetchRequest
-        Environment and table.
-    clock : callable
-        Returns seconds, to time rounds and batches.
-
-    Raises
-    ------
-    GridError
-        If the environment has another grid than the request's.
-    DatabaseError
-        If the environment cannot be opened.
+    clock : returns seconds, to time rounds and batches. Raises GridError if the environment has
+    another grid than the request's.
     """
 
     def __init__(
@@ -243,14 +232,8 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
     """Fetch until a stop is requested, even without a database; the work of the process.
 
     If the database cannot be opened, the process ends only if its table is new. With the table of
-    an earlier process it tries again.
-
-    Raises
-    ------
-    GridError
-        If the environment was replaced by one with another grid.
-    UsageError
-        If the table has distances and an object was written that has none.
+    an earlier process it tries again. Raises GridError if the environment was replaced by one with
+    another grid, UsageError if the table has distances and an object was written that has none.
     """
     table = request.table
     is_first = table.version == FIRST_VERSION

@@ -197,14 +197,10 @@ class ResidentCells(Closes):
         return None
 
     def supervise(self) -> None:
-        """Start the prefetch process again if it has ended. Sessions call it in `wait`.
+        """Start the prefetch process again if it has ended.
 
-        Raises
-        ------
-        GridError
-            If the environment was replaced by one with another grid.
-        UsageError
-            If the cells have distances and an object was written that has none.
+        Raises GridError if the environment was replaced by one with another grid, UsageError if the
+        cells have distances and an object was written that has none.
         """
         with self._supervising:
             if self.table.cells.control["is_over"]:

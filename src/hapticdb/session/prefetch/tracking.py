@@ -146,20 +146,7 @@ class _TrackedSession:
 
 
 class SessionTracker:
-    """All sessions of one table.
-
-    Parameters
-    ----------
-    table : CellTable
-        Sessions report on its request queue where their tools are.
-    grid : Grid
-        Grid of the environment.
-
-    Attributes
-    ----------
-    sessions : dict
-        Sessions by their rows of the request queue, ascending.
-    """
+    """All sessions of one table, by their rows of its request queue, ascending."""
 
     def __init__(self, table: CellTable, grid: Grid) -> None:
         self._table = table
@@ -260,13 +247,6 @@ class ObjectAnswers:
     """Answers on the request queue: ids of the objects in the requested voxels.
 
     These are the objects in the voxels; in a table with distances, those near the voxels, too.
-
-    Parameters
-    ----------
-    table : CellTable
-        Table of the sessions.
-    residency : Residency
-        Its cells, without the objects to exclude.
     """
 
     def __init__(self, table: CellTable, residency: Residency) -> None:

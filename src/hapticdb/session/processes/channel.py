@@ -53,10 +53,7 @@ class Channel:
     def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
         """Send a request and return the answer of the other process; one request at a time.
 
-        Raises
-        ------
-        HapticDBError
-            If the other process has ended or does not answer; and every error of the other process.
+        Raises the other process's error, or `HapticDBError` if it has ended or does not answer.
         """
         with self._asking:
             try:
@@ -75,12 +72,8 @@ class Channel:
         """Receive a request, do it, and send its result or error.
 
         Any other error than a HapticDBError is logged, and sent as one without its words. The
-        request's descriptors are closed afterwards.
-
-        Raises
-        ------
-        EOFError, OSError
-            If the other process has closed its end, or has died; never for what `do` raises.
+        request's descriptors are closed afterwards. Raises EOFError or OSError only if the other
+        process has closed its end, or has died.
         """
         asked, descriptors = self.receive()
         try:

@@ -134,16 +134,9 @@ def start(
     """Start a process for a function.
 
     work, with_kernels : as for `Order`; streams : descriptors of its standard input, output and
-    errors; numbers : more descriptors, with the same numbers there.
-
-    Returns its process id, and its descriptor (pidfd).
-
-    Raises
-    ------
-    OSError
-        If the machine has no room for another process.
-    HapticDBError
-        If the server does not answer.
+    errors; numbers : more descriptors, with the same numbers there. Returns its process id, and its
+    descriptor (pidfd). Raises OSError if the machine has no room for another process, HapticDBError
+    if the server does not answer.
     """
     wanted = _order(work, numbers, with_kernels=with_kernels)
     folder = os.open(".", os.O_PATH)

@@ -37,17 +37,9 @@ _parent: Channel | None = None
 class Process:
     """One process of a session, in its parent.
 
-    Parameters
-    ----------
-    work : str
-        Function that the process calls, as ``package.module:function``; its arguments are the
-        request and a `MessageSender`.
-    request : object
-        Argument of that function; picklable.
-    descriptors : sequence of int
-        File descriptors that the process inherits, under the same numbers.
-    with_kernels : bool
-        Whether it begins with the function's module and its kernels loaded.
+    work : function as ``package.module:function``, called with the request and a `MessageSender`;
+    descriptors : inherited under the same numbers; with_kernels : begin with the function's module
+    and its kernels loaded.
     """
 
     def __init__(
@@ -82,12 +74,9 @@ class Process:
         return not self.wait(0.0)
 
     def receive(self, seconds: float) -> Message | None:
-        """Return the next message, or None if none comes in `seconds` or the process has ended.
+        """Next message; None if none comes in `seconds` or the process has ended.
 
-        Raises
-        ------
-        HapticDBError
-            If the process ended with this error.
+        Raises the error with which the process ended.
         """
         arrived = select.poll()  # `select` refuses descriptors from 1024 on
         arrived.register(self._channel.sock, select.POLLIN)
@@ -103,13 +92,7 @@ class Process:
         return message
 
     def await_ready(self, name: str) -> Any:  # noqa: ANN401 - what was sent
-        """Content of the first message; without one the process is ended.
-
-        Raises
-        ------
-        HapticDBError
-            That says why, or with which the process ended.
-        """
+        """Content of the first message; without one the process is ended, and an error raised."""
         try:
             ready, is_slow = self.receive(START_PATIENCE), self.is_alive
         except BaseException:

@@ -30,7 +30,7 @@ def work(request: PageRequest, sender: MessageSender) -> None:
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
         who = connection.visitor(client.client_id)
-        client.gui.add_markdown(f"{who.name} is a {who.role}")
+        client.gui.add_markdown(f"{who.name} is a {who.role} {who.shown}")
 
     sender.send("ready", server.get_port())
     number = 0

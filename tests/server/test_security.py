@@ -21,7 +21,7 @@ from hapticdb.server.access import Role
 from hapticdb.server.limits import Limits
 from hapticdb.server.served import Serving, check
 from hapticdb.session.processes.process import Process
-from serving import CAMERA, TOKENS, Running, close_code, running, sent, text_until, urls
+from serving import CAMERA, TOKENS, Running, browser_at, close_code, running, sent, text_until, urls
 
 EDITOR = "a-token-for-editor"
 
@@ -66,7 +66,7 @@ def test_a_rebound_name_is_refused(server: Running, host: str) -> None:
 def test_another_site_opens_no_socket_and_sends_no_form(server: Running, origin: str) -> None:
     with pytest.raises(InvalidStatus):
         server.browser(Role.EDITOR, Origin=origin)
-    answer, _ = server.ask("/sign-in", "POST", f"token={EDITOR}".encode(), Origin=origin)
+    answer, _ = server.ask("/", "POST", f"token={EDITOR}".encode(), Origin=origin)
     assert (answer.status, answer.getheader("set-cookie")) == (403, None)
 
 
@@ -80,11 +80,22 @@ def test_a_socket_without_an_origin_is_a_programs_and_needs_a_token(server: Runn
 
 
 def test_a_form_needs_an_origin_and_a_small_body(server: Running) -> None:
-    assert server.ask("/sign-in", "POST", b"token=x")[0].status == 403
+    assert server.ask("/", "POST", b"token=x")[0].status == 403
     own = f"http://{server.place}"
-    assert server.ask("/sign-in", "POST", b"x" * 5000, Origin=own)[0].status == 413
-    answer, _ = server.ask("/sign-in", "POST", f"token={EDITOR}".encode(), Origin=own)
+    assert server.ask("/", "POST", b"x" * 5000, Origin=own)[0].status == 413
+    answer, _ = server.ask("/", "POST", f"token={EDITOR}".encode(), Origin=own)
     assert (answer.status, answer.getheader("location")) == (303, "/")
+
+
+def test_a_link_shows_parts_by_their_ids_and_is_kept_by_a_sign_in(server: Running) -> None:
+    _, body = server.ask(f"/see/1,2?token={EDITOR}&initialCameraNear=3")
+    assert b'url=/see/1,2?initialCameraNear=3"' in body
+    shown = {"Authorization": f"Bearer {EDITOR}"}
+    with browser_at(f"{server.place}/see/1,2", **shown) as client:
+        sent(client, CAMERA)
+        assert "is a editor (1, 2)" in text_until(client, "is a editor")
+    with pytest.raises(InvalidStatus):
+        browser_at(f"{server.place}/see/1,x", **shown)
 
 
 def test_every_answer_has_the_headers_that_restrain_browsers(server: Running) -> None:
@@ -190,7 +201,7 @@ def test_what_is_silent_or_asks_twice_is_cut(environment: Path) -> None:
         for said, answer in (
             ("", b""),
             ("GET / HTTP/1.1\r\nHost: x\r\nX: ", b""),
-            (f"POST /sign-in HTTP/1.1\r\n{host}{form}\r\n", b"HTTP/1.1 408 "),
+            (f"POST / HTTP/1.1\r\n{host}{form}\r\n", b"HTTP/1.1 408 "),
             # nothing answers the first letter of the next request
             (f"GET /none HTTP/1.1\r\n{host}\r\nG", b"HTTP/1.1 404 "),
         ):

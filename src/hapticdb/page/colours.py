@@ -20,8 +20,6 @@ TORQUE: Colour = (126, 87, 194)
 """Arrow of the torque."""
 MARK: Colour = (214, 39, 60)
 """Tool of a sweep at its first collision."""
-HELD: Colour = (250, 176, 5)
-"""Default colour of the selected parts' colour control."""
 GOLDEN = 0.61803398875
 """Golden ratio: step in hue, as a share of the circle, so that neighbours in number differ most."""
 FAMILIES: tuple[Colour, ...] = (

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
 LOG = logging.getLogger("hapticdb.page")
-SECRET, NAME, ROLE = "hapticdb-secret", "hapticdb-name", "hapticdb-role"
+SECRET, NAME, ROLE, SHOWN = (f"hapticdb-{word}" for word in ("secret", "name", "role", "shown"))
 """Headers of the server's connections to the page."""
 ROLES = ("viewer", "toucher", "editor")
 """Roles; each includes the rights of those before it: to view, to touch, to move parts."""
@@ -59,10 +59,11 @@ class PageRequest(NamedTuple):
 
 
 class Visitor(NamedTuple):
-    """Person at a browser: displayed name, and role."""
+    """Person at a browser: displayed name, role, and ids of the parts that the link shows."""
 
     name: str
     role: str
+    shown: tuple[int, ...] = ()
 
     def may(self, role: str) -> bool:
         """Whether the visitor has at least this role."""
@@ -111,7 +112,8 @@ class PageConnection:
         shown = "".join(request.headers.get_all(SECRET)).encode(errors="replace")
         if not hmac.compare_digest(shown, self._secret):
             raise KeyError(client_id)
-        return Visitor(request.headers[NAME], request.headers[ROLE])
+        ids = tuple(int(i) for i in request.headers.get(SHOWN, "").split(",") if i)
+        return Visitor(request.headers[NAME], request.headers[ROLE], ids)
 
     def tell(self, word: str) -> None:
         """Send a message to the server; ignored if the server has ended."""

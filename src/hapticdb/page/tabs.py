@@ -13,6 +13,7 @@ from hapticdb.page.panels.parts import PartsPanel
 from hapticdb.page.panels.record import RecordPanel
 from hapticdb.page.panels.sweeps import SweepPanel
 from hapticdb.page.panels.touch import TouchPanel
+from hapticdb.page.panels.viewing import ViewControls
 from hapticdb.page.site import Site
 from hapticdb.store.base import Object
 
@@ -27,6 +28,7 @@ class TabbedBrowser(Browser):
         super().__init__(site, client, visitor, number)
         gui = client.gui
         self._n_waiting = -1  # parts without a shape yet; -1: never counted
+        self.view = ViewControls(self, gui)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Touch"):
             self.touch = TouchPanel(self, gui)
@@ -38,7 +40,11 @@ class TabbedBrowser(Browser):
             self.clashes = ClashPanel(self, gui)
         with tabs.add_tab("Record"):
             self.record = RecordPanel(self, gui)
-        client.scene.on_click()(self.guarded("viewer", self._clicked))
+        for modifier in (None, "cmd/ctrl"):
+            client.scene.on_click(modifier=modifier)(self.guarded("viewer", self._clicked))
+        self.parts.choose(visitor.shown)
+        if len(self.chosen) == 2:
+            self.parts.measure()
         if visitor.may("toucher"):
             self.take_in_hand(self.tool)
 
@@ -64,6 +70,7 @@ class TabbedBrowser(Browser):
     def tick(self, now: float) -> None:
         """Show the newest frame, of the session and of a replay."""
         self.record.tick(now)
+        self.view.tick(now)
         for work in self.works:
             work.tick()
         contents = self.site.view.contents
@@ -89,4 +96,5 @@ class TabbedBrowser(Browser):
     def _clicked(self, event: Any) -> None:  # noqa: ANN401 - an event of viser
         origin = checks.numbers_of(event.ray_origin, 3, checks.FARTHEST, "a ray")
         way = checks.numbers_of(event.ray_direction, 3, checks.FARTHEST, "a ray")
-        self.parts.clicked(origin, way)
+        adds = event.modifier is not None
+        self.parts.clicked(self.view.seen_from(origin, way), way, adds=adds)

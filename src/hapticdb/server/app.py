@@ -47,11 +47,12 @@ def application(
         return Response(text, media_type="text/plain; version=0.0.4")
 
     routes: list[BaseRoute] = [
-        Route("/", door.view, methods=["GET"]),
-        Route("/sign-in", door.sign_in, methods=["POST"]),
+        Route("/", door.view, methods=["GET", "POST"]),
+        Route("/see/{shown}", door.view, methods=["GET", "POST"]),
         Route("/healthz", healthz, methods=["GET"]),
         Route("/metrics", metrics, methods=["GET"]),
         WebSocketRoute("/", relay.browser),
+        WebSocketRoute("/see/{shown}", relay.browser),
     ]
     # viser's client omits the last slash of the page's address
     bare: list[BaseRoute] = [WebSocketRoute(prefix, relay.browser)] if prefix else []

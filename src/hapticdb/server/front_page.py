@@ -155,13 +155,13 @@ FORM = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>{title}</title><style>{style}</style></head>
 <body><h1>{title}</h1><p>{words}</p>
-<form method="post" action="{prefix}/sign-in">
+<form method="post">
 <label>Token <input type="password" name="token" autocomplete="current-password" required
 autofocus></label><button>Open</button></form></body></html>
 """
 ONWARD = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<meta http-equiv="refresh" content="0;url={prefix}/"></head><body></body></html>
+<meta http-equiv="refresh" content="0;url={url}"></head><body></body></html>
 """
 """Leads to the view, with a URL without the token. After a link from another site, a redirect would
 lose the cookie, which is SameSite=Strict."""
@@ -182,15 +182,16 @@ class FrontDoor:
         self._tries: dict[str, TokenBucket] = {}
 
     async def view(self, request: Request) -> Response:
-        """Answer a GET of the page."""
+        """Answer a request of the page: a POST is that of the form, with the token."""
+        if request.method == "POST":
+            return await self._posted(request)
         if "token" in request.query_params:
             return self._sign_in(request, request.query_params["token"])
         if self._access.role_of_headers(request.headers) is None:
             return self._form("This page needs a token. Whoever started the server has it.", 401)
         return self._view(request)
 
-    async def sign_in(self, request: Request) -> Response:
-        """Answer the posted form."""
+    async def _posted(self, request: Request) -> Response:
         body = b""
         try:
             async with asyncio.timeout(self._limits.request_seconds):
@@ -211,13 +212,14 @@ class FrontDoor:
         cookie = self._access.sign_in(token)
         if cookie is None:
             return self._form("That token is wrong.", 403)
+        rest = request.url.remove_query_params("token")
+        url = f"{rest.path}?{rest.query}" if rest.query else rest.path
         answer: Response
         if request.method == "GET":
-            answer = HTMLResponse(
-                ONWARD.format(title=html.escape(self._title), prefix=self._prefix)
-            )
+            title, url = html.escape(self._title), html.escape(url)
+            answer = HTMLResponse(ONWARD.format(title=title, url=url))
         else:
-            answer = RedirectResponse(f"{self._prefix}/", 303)
+            answer = RedirectResponse(url, 303)
         answer.set_cookie(
             self._access.cookie_name,
             cookie,
@@ -244,7 +246,6 @@ class FrontDoor:
             title=html.escape(self._title),
             style=STYLE,
             words=html.escape(words),
-            prefix=self._prefix,
         )
         return HTMLResponse(page, status, {"content-security-policy": POLICY})
 

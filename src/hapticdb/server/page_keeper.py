@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable
 
 from hapticdb.errors import HapticDBError
-from hapticdb.page.connection import LONGEST_LINE, NAME, ROLE, SECRET, line
+from hapticdb.page.connection import LONGEST_LINE, NAME, ROLE, SECRET, SHOWN, line
 from hapticdb.session.processes.process import Process
 
 LOG = logging.getLogger("hapticdb.server")
@@ -115,9 +115,9 @@ class PageKeeper:
             except (HapticDBError, OSError) as error:
                 LOG.error("the page cannot start: %s", error)  # noqa: TRY400 - its message says all
 
-    def headers(self, name: str, role: str) -> dict[str, str]:
-        """Headers for a browser's connection of this name and role, with the secret."""
-        return {SECRET: self._secret, NAME: name, ROLE: role}
+    def headers(self, name: str, role: str, shown: str) -> dict[str, str]:
+        """Headers for a browser's connection: name, role, ids of shown parts, and the secret."""
+        return {SECRET: self._secret, NAME: name, ROLE: role, SHOWN: shown}
 
     def tell(self, word: str, text: str = "") -> None:
         """Send the page a message; no effect without a page."""

@@ -24,6 +24,8 @@ from hapticdb.server.page_keeper import PageKeeper
 LOG = logging.getLogger("hapticdb.server")
 VERSION = re.compile(r"viser-v[0-9A-Za-z.+-]{1,32}")
 """WebSocket subprotocol with the version of viser's client, compared by the page."""
+IDS = re.compile(r"(\d{1,10}(,\d{1,10}){0,49})?")
+"""Form of the parts that a link shows."""
 WAITING_MESSAGES = 4
 """Queued messages of the page for one browser."""
 CONNECT_PATIENCE = 5.0
@@ -81,12 +83,15 @@ class Relay:
             cookie = ""  # expired: the role comes from elsewhere
         if len(self._numbers) >= self._limits.browsers or not self._arrivals.take():
             raise Closing(TRY_LATER, "too many browsers; try again later", "full")
+        shown = str(websocket.path_params.get("shown", ""))
+        if not IDS.fullmatch(shown):
+            raise Closing(POLICY, "a link shows at most 50 parts, by their ids", "refused")
         offered = [Subprotocol(p) for p in websocket.scope["subprotocols"] if VERSION.fullmatch(p)]
         if len(offered) != 1:
             raise Closing(POLICY, "this is no browser's page", "refused")
         with self._numbered() as number:
             name = f"Guest {number}"
-            upstream = await self._connected(name, role, offered[0])
+            upstream = await self._connected(name, role, shown, offered[0])
             try:
                 await websocket.accept(upstream.subprotocol)
                 LOG.info("a browser is connected", extra={"guest": name, "role": role.word})
@@ -108,14 +113,16 @@ class Relay:
         finally:
             self._numbers.discard(number)
 
-    async def _connected(self, name: str, role: Role, version: Subprotocol) -> ClientConnection:
+    async def _connected(
+        self, name: str, role: Role, shown: str, version: Subprotocol
+    ) -> ClientConnection:
         """Connect to the page."""
         try:
             if not self._keeper.is_ready:
                 raise ConnectionError("it is starting")
             return await connect(
                 f"ws://127.0.0.1:{self._keeper.port}/",
-                additional_headers=self._keeper.headers(name, role.word),
+                additional_headers=self._keeper.headers(name, role.word, shown),
                 subprotocols=[version],
                 compression=None,  # costs more time than the loopback interface
                 max_size=None,

@@ -1,4 +1,4 @@
-"""Tab Parts: search, properties, visibility, distances, and moves of parts."""
+"""Tab Parts: tree, properties, visibility, distances, and moves of parts."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.batches.exact import MET, Distance
 from hapticdb.environment import Environment
+from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
 from hapticdb.page.panels.moving import MovingControls
-from hapticdb.page.scene.names import assemblies_of, found_ids
-from hapticdb.page.widgets import put
-from hapticdb.page.wording import note_html, plain_name, rows_html, short_name, size_text
+from hapticdb.page.panels.tree import PartTree
+from hapticdb.page.panels.working import Work
+from hapticdb.page.wording import note_html, rows_html, short_name, size_text
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.units import length_text
 
@@ -22,37 +24,25 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-NOTHING = "choose from the list"
-"""First line of the list."""
-MOST_LISTED = 1_000
-"""Greatest length of the list. Larger: slower to open in a browser."""
-LONGEST_SEARCH = 200
-"""Greatest length of a search, characters."""
 MOST_VOXELS = 60_000
 """Greatest number of voxels drawn of a part; of a larger part, every n-th. Larger: more is sent."""
+ACTS = ("Hide", "Show", "Isolate", "See-through", "Show all", "Choose none")
+CHOOSE = "Click a part, or press its name. Ctrl and a click add one."
 
 
 class PartsPanel:
-    """Search and selection of parts; visibility and collision of parts in this browser."""
+    """Selection of parts; their visibility, collision and distances in this browser."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._client = browser.client
-        self._lines: dict[str, tuple[int, ...]] = {}
         self._ends: list[Floats] = []
         self._voxels: Any = None
         guard = browser.guarded
-        self._search = gui.add_text("Search", "", hint="Parts of a name, in any order.")
-        self._search.on_update(guard("viewer", self._searched))
-        self._where = gui.add_html("")
-        self._list_of = gui.add_dropdown("Parts", (NOTHING,), initial_value=NOTHING)
-        self._list_of.on_update(guard("viewer", self._pick))
+        self._tree = PartTree(browser, gui, self._toggle)
         with gui.add_folder("Chosen"):
-            self._what = gui.add_html(note_html("Click a part, or choose one above."))
-            self._act = gui.add_button_group("Show", ("Hide", "Isolate", "Show all"))
-            self._act.on_click(guard("viewer", self._show_or_hide))
-            colour = gui.add_rgb("Colour", colours.HELD)
-            colour.on_update(guard("viewer", self._colour))
+            self._what = gui.add_html(note_html(CHOOSE))
+            gui.add_button_group("", ACTS).on_click(guard("viewer", self._show_or_hide))
             voxels = gui.add_checkbox("Voxels", initial_value=False)
             voxels.on_update(guard("viewer", self._show_voxels))
             self._voxel_box = voxels
@@ -65,70 +55,47 @@ class PartsPanel:
             self._back = gui.add_button("Put it back", visible=False)
             self._back.on_click(guard("toucher", lambda _: browser.put_back()))
         with gui.add_folder("Distance", expand_by_default=False):
+            between = gui.add_button("Measure between two chosen parts")
+            between.on_click(guard("viewer", lambda _: self.measure()))
             self._measures = gui.add_checkbox("Measure between two clicks", initial_value=False)
             self._measures.on_update(guard("viewer", self._start_measuring))
-            self._distance = gui.add_html(note_html("Tick the box, then click two places."))
+            self._work = Work(browser, gui, "a measurement", "parts")
         self.moving = MovingControls(browser, gui)
-        self.show_objects()
 
     def show_objects(self) -> None:
-        """Update the list and the selection."""
-        self._list()
+        """Update the tree and the selection."""
+        self._tree.show()
         self._say_chosen()
 
-    def _list(self) -> None:
-        objects = self._browser.site.objects
-        search, hidden = self._search.value.strip(), self._browser.scene.hidden
-        names = {i: obj.name for i, obj in objects.items()}
-        found: list[tuple[str, tuple[int, ...]]]
-        if search:
-            found = [(names[i], (i,)) for i in found_ids(names, search[:LONGEST_SEARCH])]
-        else:
-            found = [
-                (f"▸ {path} ({len(ids):,} parts)", tuple(ids))
-                for path, ids in assemblies_of(names).items()
-            ]
-            found += [(name, (i,)) for i, name in sorted(names.items(), key=lambda one: one[::-1])]
-        self._lines = {}
-        for name, ids_of in found[:MOST_LISTED]:
-            label = plain_name(name)
-            if label in self._lines:
-                label = f"{label} [{ids_of[0]}]"
-            self._lines[label + (" (hidden)" if hidden.issuperset(ids_of) else "")] = ids_of
-        more = f", {MOST_LISTED:,} listed" if len(found) > MOST_LISTED else ""
-        n_found = len(found) if search else len(objects)
-        self._where.content = note_html(f"{n_found:,} of {len(objects):,} parts{more}")
-        self._list_of.options = (NOTHING, *self._lines)
-        put(self._list_of, NOTHING)
-
-    def _searched(self, event: "GuiEvent[Any]") -> None:
-        checks.text_of(event.target.value, LONGEST_SEARCH, "a search")
-        self._list()
-
-    def _pick(self, event: "GuiEvent[Any]") -> None:
-        if event.client is not None and event.target.value != NOTHING:
-            label = checks.choice_of(event.target.value, tuple(self._lines), "a part")
-            self.choose(self._lines[label])
-
-    def clicked(self, origin: Floats, way: Floats) -> None:
-        """Select the first part along a ray, or use the point as an end of a distance."""
+    def clicked(self, origin: Floats, way: Floats, *, adds: bool) -> None:
+        """Select the first part along a ray and name it, or use the point as a distance's end."""
         browser = self._browser
         met = browser.scene.pick(origin, way)
-        if met is None:
-            if not self._measures.value:
-                self.choose(())
-            return
         if self._measures.value:
-            self._add_end(met.point)
+            if met is not None:
+                self._add_end(met.point)
+        elif met is None:
+            self.choose(())
         else:
-            self.choose((met.id,))
+            self._toggle((met.id,)) if adds else self.choose((met.id,))
+            self._client.scene.add_label(
+                "/named", short_name(browser.site.objects[met.id].name),
+                position=tuple(met.point), anchor="bottom-center",
+            )  # fmt: skip
+
+    def _toggle(self, ids: Sequence[int]) -> None:
+        """Add objects to the selection; remove them if all are in it."""
+        chosen = self._browser.chosen
+        added = [i for i in ids if i not in chosen]
+        self.choose((*chosen, *added) if added else [i for i in chosen if i not in ids])
 
     def choose(self, ids: Sequence[int]) -> None:
         """Highlight objects, and show their properties."""
         browser = self._browser
         browser.chosen = tuple(i for i in ids if i in browser.site.objects)
         browser.scene.highlight(browser.chosen)
-        self._say_chosen()
+        self._client.scene.remove_by_name("/named")
+        self.show_objects()
         self.moving.follow()
         if self._voxel_box.value:
             self._draw_voxels()
@@ -136,7 +103,7 @@ class PartsPanel:
     def _say_chosen(self) -> None:
         chosen = self._browser.chosen_objects()
         if not chosen:
-            said = note_html("Click a part, or choose one above.")
+            said = note_html(CHOOSE)
         elif len(chosen) == 1:
             obj = chosen[0]
             said = rows_html(
@@ -155,27 +122,26 @@ class PartsPanel:
 
     def _show_or_hide(self, event: "GuiEvent[Any]") -> None:
         browser = self._browser
-        word = checks.choice_of(event.target.value, ("Hide", "Isolate", "Show all"), "what to show")
+        word = checks.choice_of(event.target.value, ACTS, "what to show")
         scene, chosen = browser.scene, browser.chosen
-        if word == "Show all":
+        if word == "Choose none":
+            self.choose(())
+        elif word == "Show all":
             scene.show()
         elif not chosen:
-            raise UsageError("choose a part first: click it, or take it from the list")
+            raise UsageError("choose a part first: click it, or press its name")
         elif word == "Isolate":
             scene.isolate(chosen)
-        elif scene.hidden.issuperset(chosen):
+        elif word == "See-through":
+            scene.see_through(chosen)
+        elif word == "Show":
             scene.show(chosen)
         else:
             scene.hide(chosen)
         if browser.taken is not None:
             scene.hide((browser.taken,))
         browser.filter_changed()
-        self._list()
-
-    def _colour(self, event: "GuiEvent[Any]") -> None:
-        red, green, blue = checks.numbers_of(event.target.value, 3, 255.0, "a colour")
-        browser = self._browser
-        browser.scene.colour(browser.chosen, (int(abs(red)), int(abs(green)), int(abs(blue))))
+        self._tree.show()
 
     def _show_voxels(self, event: "GuiEvent[Any]") -> None:
         if checks.flag_of(event.target.value, "voxels"):
@@ -240,18 +206,41 @@ class PartsPanel:
         """Show the button "Put it back" if a part is dragged."""
         self._back.visible = self._browser.taken is not None
 
+    def measure(self) -> None:
+        """Measure between two chosen parts."""
+        if len(self._browser.chosen) != 2:
+            raise UsageError("choose two parts first: click one, and the other with Ctrl")
+        (a, b), url = self._browser.chosen, self._browser.site.url
+
+        def job(_: object) -> Distance:
+            with open_environment(url, read_only=True) as env:
+                return env.distance(a, b)
+
+        def show(found: Distance) -> None:
+            least, most = length_text(found.at_least), length_text(found.at_most)
+            meet = found.at_most <= MET
+            self._draw_distance(
+                found.on_a, found.on_b,
+                "they meet" if meet else most if least == most else f"{least} to {most}",
+            )  # fmt: skip
+
+        self._work.begin(job, show)
+
     def _start_measuring(self, event: "GuiEvent[Any]") -> None:
         checks.flag_of(event.target.value, "measuring")
         self._ends = []
         self._browser.scene.clear_measure()
-        self._distance.content = note_html("Click two places.")
+        self._work.said.content = note_html("Click two places.")
 
     def _add_end(self, point: Floats) -> None:
         self._ends = [*self._ends, point] if len(self._ends) == 1 else [point]
         if len(self._ends) == 1:
-            self._distance.content = note_html("Click the second place.")
+            self._work.said.content = note_html("Click the second place.")
             return
         start, end = self._ends
-        distance = length_text(self._browser.scene.measure(start, end))
+        self._draw_distance(start, end, length_text(float(np.linalg.norm(end - start))))
+
+    def _draw_distance(self, start: Floats, end: Floats, words: str) -> None:
+        self._browser.scene.measure(start, end, words)
         along = " / ".join(length_text(float(x)) for x in np.abs(end - start))
-        self._distance.content = rows_html((("Distance", distance), ("Along x / y / z", along)))
+        self._work.said.content = rows_html((("Distance", words), ("Along x / y / z", along)))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.page import checks, colours
-from hapticdb.page.browser import LEAST_SHOWN, Browser
+from hapticdb.page.browser import Browser
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import (
     MOST_SAID,
@@ -60,8 +60,6 @@ class TouchPanel:
         self._tool.on_update(browser.guarded("toucher", self._choose_tool))
         home = gui.add_button("Back to the start", color="gray")
         home.on_click(browser.guarded("toucher", self._go_home))
-        see = gui.add_button_group("See", ("Tool", "All"))
-        see.on_click(browser.guarded("toucher", self._look))
         with gui.add_folder("Where the hand is", expand_by_default=False):
             step = float(10.0 ** np.floor(np.log10(browser.site.facts.diagonal / 200)))
             self._place = [gui.add_number(f"{axis}, m", 0.0, step=step) for axis in "xyz"]
@@ -96,14 +94,6 @@ class TouchPanel:
         browser = self._browser
         browser.put_back()
         browser.take_in_hand(browser.tool)
-
-    def _look(self, event: "GuiEvent[Any]") -> None:
-        browser, facts = self._browser, self._browser.site.facts
-        middle, radius = facts.bounds.mean(axis=0), 0.5 * facts.diagonal
-        if checks.choice_of(event.target.value, ("Tool", "All"), "what to see") == "Tool":
-            middle = browser.hand[:3]
-            radius = max(2.0 * browser.tool.radius, LEAST_SHOWN * facts.diagonal)
-        browser.scene.fly_to(middle, radius)
 
     def _type_place(self, event: "GuiEvent[Any]") -> None:
         if event.client is None:  # set by the page

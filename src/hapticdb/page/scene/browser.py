@@ -14,7 +14,6 @@ from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.nodes import Member
 from hapticdb.page.scene.picking import Struck
 from hapticdb.page.scene.surroundings import FIELD_OF_VIEW, add_shadow
-from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from viser import ClientHandle
@@ -24,6 +23,8 @@ FLIGHT_S, FLIGHT_STEPS = 0.6, 18
 """Duration of a camera motion, seconds, and its steps."""
 INK: Colour = (24, 32, 44)
 """Colour of distance lines and labels."""
+SHEER = 70
+"""Opacity of see-through objects, 0 to 255."""
 
 
 @dataclass
@@ -33,7 +34,7 @@ class _Look:
     hidden: set[int] = field(default_factory=set)
     isolated: frozenset[int] | None = None
     marked: set[int] = field(default_factory=set)
-    colours: dict[int, Colour] = field(default_factory=dict)
+    sheer: set[int] = field(default_factory=set)
     spotlit: dict[int, Colour] = field(default_factory=dict)
 
     def sees(self, object_id: int) -> bool:
@@ -47,9 +48,8 @@ class _Look:
             return None
         if self.spotlit:
             return FADED
-        if member.id in self.marked:
-            return MARKED
-        return self.colours.get(member.id, member.colour)
+        colour = MARKED if member.id in self.marked else member.colour
+        return (*colour, SHEER) if member.id in self.sheer else colour
 
 
 class BrowserScene:
@@ -75,17 +75,17 @@ class BrowserScene:
         return {i for i in list(self._contents.records) if not self._look.sees(i)}
 
     def show(self, ids: Iterable[int] | None = None) -> None:
-        """Show objects; without ids show all, and end `isolate`."""
+        """Show objects; without ids show all, and end `isolate` and `see_through`."""
         with self._contents.lock:
-            before = self.hidden
+            before, sheer = self.hidden, self._look.sheer
             if ids is None:
-                self._look.hidden, self._look.isolated = set(), None
+                self._look.hidden, self._look.isolated, self._look.sheer = set(), None, set()
             else:
                 shown = set(ids)
                 self._look.hidden -= shown
                 if self._look.isolated is not None:
                     self._look.isolated |= shown
-            self._draw(before ^ self.hidden)
+            self._draw((before ^ self.hidden) | (sheer ^ self._look.sheer))
         self.shade()
 
     def hide(self, ids: Iterable[int]) -> None:
@@ -116,11 +116,11 @@ class BrowserScene:
             before, self._look.marked = self._look.marked, set(ids)
             self._draw(before ^ self._look.marked)
 
-    def colour(self, ids: Iterable[int], colour: Colour) -> None:
-        """Colour objects, sRGB 0 to 255."""
+    def see_through(self, ids: Iterable[int]) -> None:
+        """Make objects see-through; solid again if all of them are."""
         with self._contents.lock:
             wanted = set(ids)
-            self._look.colours.update(dict.fromkeys(wanted, colour))
+            self._look.sheer ^= wanted if wanted <= self._look.sheer else wanted - self._look.sheer
             self._draw(wanted)
 
     def spotlight(self, colours: Mapping[int, Colour]) -> None:
@@ -130,10 +130,21 @@ class BrowserScene:
             is_whole = bool(before) != bool(colours)
             self._draw(list(self._contents.records) if is_whole else before | self._look.spotlit)
 
-    def fly_to(self, middle: Floats, radius: float) -> None:
-        """Move the camera, in short steps, until a sphere fills its view: centre (3,), metres."""
+    def fit(self, ids: set[int]) -> None:
+        """Fly to objects that are shown."""
+        boxes = self._contents.boxes(lambda i: i in ids)
+        low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+        self.fly_to((low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-9))
+
+    def fly_to(self, middle: Floats, radius: float, side: Floats | None = None) -> None:
+        """Move the camera, in short steps, until a sphere fills its view: centre (3,), metres.
+
+        side : direction (3,) from the centre to the eye, taken at once; else as now.
+        """
         camera = self._client.camera
         start = np.stack([camera.position, camera.look_at])
+        if side is not None:
+            start[0] = start[1] + side * float(np.linalg.norm(start[0] - start[1]))
         way = start[0] - start[1]
         way *= radius / np.sin(FIELD_OF_VIEW / 2) / max(float(np.linalg.norm(way)), 1e-12)
         for step in range(1, FLIGHT_STEPS + 1):
@@ -151,8 +162,8 @@ class BrowserScene:
         """First visible object along a ray, world frame."""
         return self._contents.pick(origin, direction, self._look.sees)
 
-    def measure(self, start: ArrayLike, end: ArrayLike) -> float:
-        """Draw the distance of two points (3,), metres, with a label; returns it."""
+    def measure(self, start: ArrayLike, end: ArrayLike, words: str) -> None:
+        """Draw a line between two points (3,), metres, with a label."""
         ends = np.array([start, end], dtype=np.float64)
         distance = float(np.linalg.norm(ends[1] - ends[0]))
         scene = self._client.scene
@@ -172,11 +183,10 @@ class BrowserScene:
             )
             scene.add_label(
                 "/distance/label",
-                length_text(distance),
+                words,
                 position=tuple(ends.mean(axis=0)),
                 anchor="bottom-center",
             )
-        return distance
 
     def clear_measure(self) -> None:
         """Remove the line and the label of `measure`."""

@@ -1,6 +1,7 @@
 """Object names: sub-assemblies and search."""
 
 from collections.abc import Mapping
+from typing import TypeVar
 
 
 def assemblies_of(names: Mapping[int, str]) -> dict[str, list[int]]:
@@ -14,8 +15,11 @@ def assemblies_of(names: Mapping[int, str]) -> dict[str, list[int]]:
     return found
 
 
-def found_ids(names: Mapping[int, str], text: str) -> list[int]:
-    """Ids of the names with each word of a text, in any order and case.
+Key = TypeVar("Key", int, str)
+
+
+def found_ids(names: Mapping[Key, str], text: str) -> list[Key]:
+    """Keys of the names with each word of a text, in any order and case.
 
     First those with the text at the start of their last element, then those with a word of it in
     their last element, then the rest; by name within each.

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -92,6 +92,9 @@ class Browser:
 
     def tool_changed(self) -> None:
         """Hook: the tool has changed."""
+
+    def choose(self, ids: Sequence[int]) -> None:
+        """Hook: choose objects."""
 
     def session_ended(self) -> None:
         """Hook: the session is over, and so is its recording."""

@@ -1,5 +1,6 @@
 """Browser with the tabs of the panel."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +43,7 @@ class TabbedBrowser(Browser):
             self.record = RecordPanel(self, gui)
         for modifier in (None, "cmd/ctrl"):
             client.scene.on_click(modifier=modifier)(self.guarded("viewer", self._clicked))
-        self.parts.choose(visitor.shown)
+        self.choose(visitor.shown)
         if len(self.chosen) == 2:
             self.parts.measure()
         if visitor.may("toucher"):
@@ -56,6 +57,10 @@ class TabbedBrowser(Browser):
         """Show the current tool."""
         self.touch.show_tool()
         self.parts.show_tool()
+
+    def choose(self, ids: Sequence[int]) -> None:
+        """Choose objects in the tab Parts."""
+        self.parts.choose(ids)
 
     def session_ended(self) -> None:
         """End the recording in its tab."""

@@ -52,6 +52,7 @@ HIDING = (
     "div:has(>.mantine-Button-root .tabler-icon-photo){order:-1}"
     "[data-dock-area]>*>.mantine-Text-root:only-child{visibility:hidden}"
     "div:has(>p>label:empty){display:none}"
+    ".mantine-Tabs-list{flex-wrap:nowrap}.mantine-Tabs-tab{padding:.75em .65em}"
     "body::after{position:fixed;z-index:9999;font:16px system-ui,sans-serif}"
     f"{HAS_GUI}:has(.tabler-icon-player-pause,.mantine-Loader-root[style*=absolute])::after{{"
     "content:'The server has ended, or cannot be reached. You see the last picture.';"
@@ -61,8 +62,8 @@ HIDING = (
 )
 """Hides viser's note about software rendering, its text in an empty tab, the place of an empty
 label, and its settings, which begin with the server's address. They stay laid out, because viser
-measures them; their button for pictures stays. Covers everything until the first widgets come; a
-line on top reports a lost connection."""
+measures them; their button for pictures stays. Keeps the tabs in one row. Covers everything until
+the first widgets come; a line on top reports a lost connection."""
 
 
 class ClientPage(NamedTuple):

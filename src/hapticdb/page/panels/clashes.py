@@ -189,6 +189,7 @@ class ClashPanel:
         least = LEAST_SHOWN * browser.site.facts.diagonal
         radius = max(min(0.75 * float(np.linalg.norm(box[1] - box[0])) for box in boxes), least)
         self._end()
+        browser.choose((one.a, one.b))  # the link of the view opens with this pair
         browser.scene.spotlight(dict(zip((one.a, one.b), colours.PAIR, strict=True)))
         words = one.status if one.is_left else f"{one.kind} {one.length_text()}"
         self._drawn = add_marks(browser.client.scene, "/clash", places, words, 0.04 * radius)

@@ -39,7 +39,6 @@ class PartsPanel:
         self._ends: list[Floats] = []
         self._voxels: Any = None
         guard = browser.guarded
-        self._tree = PartTree(browser, gui, self._toggle)
         with gui.add_folder("Chosen"):
             self._what = gui.add_html(note_html(CHOOSE))
             gui.add_button_group("", ACTS).on_click(guard("viewer", self._show_or_hide))
@@ -61,6 +60,7 @@ class PartsPanel:
             self._measures.on_update(guard("viewer", self._start_measuring))
             self._work = Work(browser, gui, "a measurement", "parts")
         self.moving = MovingControls(browser, gui)
+        self._tree = PartTree(browser, gui, self._toggle)
 
     def show_objects(self) -> None:
         """Update the tree and the selection."""

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import FileError, UsageError
+from hapticdb.tabular.tables import new_file
 from hapticdb.units import metres_of
 
 COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -100,15 +101,8 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
         raise UsageError("poses must be finite numbers")
     rows = np.hstack([matrices[:, :3, 3], quaternion_of(matrices[:, :3, :3])]) + 0.0
     lines = [",".join(COLUMNS), *(",".join(f"{value:.15g}" for value in row) for row in rows)]
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
-        partial.replace(target)
-    except OSError as error:
-        raise FileError(f"cannot write {target}: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with new_file(Path(path), "poses", replaces=True) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
 
 
 def read_poses(

@@ -14,7 +14,7 @@ import hapticdb
 from children import PATIENCE, child, descendants, named, until
 from command_line import Run, command, on_terminal, refused, succeeded
 from hapticdb.cli.session_page import tell_cost
-from hapticdb.cli.values import size_bytes
+from hapticdb.cli.values import size_of
 from hapticdb.errors import UsageError
 from hapticdb.query.law import LawName
 from hapticdb.recording.file import Frames, Recording
@@ -152,7 +152,7 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         ([*PLAY, "--scale", 0], ["a scale of 0.0"]),
         (["--device", "random", "--at", ABOVE, "--seed", -1], ["--seed -1: give 0 or more"]),
         ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
-        ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
+        ([*PLAY, "--budget", 0.5], ["--budget", "'0.5': give MiB"]),
         ([*PLAY, "--stiffness", 1e300], ["stiffness of 1e+300 N/m", "above 0, up to 1e+09"]),
         ([*PLAY, "--law", "plane", "--rendering", "coupled"], ["coupled needs distances"]),
         ([*PLAY, "--rendering", "direct", "--delay", 5], ["--delay", "with --rendering direct"]),
@@ -161,9 +161,9 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already", "--replace"]),
         ([*PLAY, "--record", "tool.npz", "--replace"], ["tool.npz is no recording"]),
         ([*PLAY, "--replace"], ["--replace", "without --record"]),
-        ([*LIMITED, "0"], ["--record-limit '0': give MiB, 1 to a million, or such as 4GiB"]),
-        ([*LIMITED, "nan"], ["--record-limit 'nan': give MiB"]),
-        ([*LIMITED, "4 parsecs"], ["--record-limit '4 parsecs': give MiB"]),
+        ([*LIMITED, "0"], ["--record-limit", "'0': give MiB, 1 to a million, or such as 4GiB"]),
+        ([*LIMITED, "nan"], ["--record-limit", "'nan': give MiB"]),
+        ([*LIMITED, "4 parsecs"], ["--record-limit", "'4 parsecs': give MiB"]),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_no_process(
@@ -278,7 +278,7 @@ def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Pat
     ("text", "n_bytes"), [("1", 1 << 20), ("1.5 GiB", 3 << 29), ("4g", 4 << 30)]
 )
 def test_a_size_is_mib_or_has_its_unit(text: str, n_bytes: int) -> None:
-    assert size_bytes(text, "--record-limit") == n_bytes
+    assert size_of(text) == n_bytes
 
 
 def recorded(path: Path) -> Frames:

@@ -23,10 +23,10 @@ NARROW: dict[str, set[str]] = {
     "closing": set(),
     "errors": set(),
     "interrupting": set(),
-    "poses": {"errors", "units"},
+    "poses": {"errors", "tabular", "units"},
     "mesh": {"errors", "poses", "units"},
     "devices": {"errors", "kernels", "poses"},
-    "sample": {"errors"},
+    "sample": {"errors", "tabular"},
 }
 PUBLIC = hapticdb.__all__
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from hapticdb.cli.values import point_of
+from hapticdb.cli.values import point_of, size_of
 from hapticdb.units import NAMES, length_of, volume_of
 
 StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
@@ -23,14 +23,12 @@ RightName = Literal["viewer", "toucher", "editor", "nobody"]
 
 TEXTS = """
 url URL: The environment: a path, sqlite:///path, postgresql://host/database.
-objects WORDS...: As 'hapticdb objects' lists them: 7 or 3,4, 'wheel*', attribute=value.
+objects WORDS...: As 'hapticdb objects' lists them.
 json: Print JSON, an object a line.
 csv FILE: Write the result as CSV to a new file; - is standard output.
 
-where WORDS: Only these objects are felt: 7 or 3,4, 'wheel*', attribute=value. Give it again for
-  more.
-exclude WORDS: Objects that are not felt: 7 or 3,4, 'wheel*', attribute=value. Give it again for
-  more.
+where WORDS: Only these objects are felt.
+exclude WORDS: Objects that are not felt.
 tool FILE: Mesh of the tool, or a shell saved as .npz.
 tool_unit: Unit of a tool whose file names no unit; metres unless given.
 path_unit [m]: Unit of the positions of the poses.
@@ -42,7 +40,7 @@ law: Force law of a frame: the tangent plane of a voxel, or a penalty on the dis
 conservative: Leave the tool's points on its surface, so that clearance is kept: with distances
   contact begins 1.5 voxels before the surface. Otherwise points are drawn inward by 1.5 voxels, and
   it begins at the surface.
-budget MIB: Memory for resident cells.
+budget SIZE [256MiB]: Memory for resident cells, MiB or such as 4GiB.
 on ADDRESS: Have workers of dask.distributed do it: its scheduler, tcp://host:8786.
 layout [brick]: Index table of a new environment.
 curve [z]: Order of the keys of a new environment.
@@ -61,7 +59,8 @@ import.origin X,Y,Z/m [so that the files are in its middle]: lower corner of the
 import.jobs N [one a processor]: Threads.
 import.keep_removed: Leave out parts that were removed.
 import.time_limit SECONDS [20 and more by its size]: Time that reading one file may take.
-import.memory_limit MIB [512 and more by its size]: Memory that reading one file may take.
+import.memory_limit SIZE [512 and more by its size]: Memory that reading one file may take, MiB or
+  such as 4GiB.
 import.voxel_limit N [a minute's work]: Voxels that the surfaces of one file may meet, by their
   area.
 import.replace: Replace objects of these files by what the files hold now.
@@ -75,7 +74,7 @@ import.partitions SERVERS: A new environment on PostgreSQL: hosts or URLs, with 
 info.calibrate: Measure what queries cost on this machine, and keep it.
 info.cold: With --calibrate: measure with empty caches, on SQLite.
 
-objects.name WORDS: Only these objects: 7 or 3,4, 'wheel*', attribute=value. Give it again for more.
+objects.name WORDS: Only these objects.
 objects.limit N [40 on a terminal, all in a pipe]: Objects to list; 0: all.
 
 touch.poses FILE: Poses x,y,z,qw,qx,qy,qz with a header, a TUM trajectory, a path as OMPL prints it,
@@ -117,7 +116,7 @@ feel.seed N [0]: Seed of the points' places, and of a random hand.
 feel.processor N: Bind the loop to that processor.
 feel.no_baseline: Skip the empty loop that is measured before, for 2 s at most.
 
-view.tool FILE: Mesh of a tool to choose from, beside a ball and a peg. Give it again for more.
+view.tool FILE: Mesh of a tool to choose from, beside a ball and a peg.
 view.rendering [coupled where there are distances]: coupled: a spring between hand and tool, which
   stays outside of surfaces; needs distances. direct: the wrench of each frame, capped.
 view.recordings FOLDER: Folder in which people's sessions may be recorded.
@@ -140,7 +139,7 @@ serve.log_json: Write the log as JSON, an object a line.
 replay.recording FILE: A session's .hdbrec.
 replay.url URL: The environment; unless given, the recorded one if its file is beside FILE.
 
-sweep.part WORDS: Instead of --tool: objects that move, all together; chosen as for --exclude.
+sweep.part WORDS: Instead of --tool: objects that move, all together.
 sweep.path FILE: Poses, as for touch --poses.
 sweep.about X,Y,Z/mm [middle of the tool's box]: the centre of the path's turns, tool's frame.
 sweep.batch CSV: Many sweeps, one a line; see above.
@@ -149,12 +148,12 @@ sweep.until_hit: End at the first hit on the path: faster.
 
 clashes.within LENGTH/mm [1]: pairs that are so near are told.
 clashes.contact LENGTH/mm [0.05]: surfaces so near, or so little one in the other, touch.
-clashes.of WORDS: One of each pair; chosen as for 'hapticdb objects'.
-clashes.against WORDS: The other one of each pair, likewise.
+clashes.of WORDS: One of each pair.
+clashes.against WORDS: The other one of each pair.
 clashes.kind KIND [all are told; overlapping, duplicate, too near and inside give exit code 1]:
-  Kinds that are told, and that exit code 1 stands for. Give it again for more.
+  Kinds that are told, and that exit code 1 stands for.
 clashes.seconds S [no limit]: Time of the search; the next call goes on.
-clashes.budget MIB: Memory for shapes.
+clashes.budget SIZE [256MiB]: Memory for shapes, MiB or such as 4GiB.
 clashes.accept A B: Accept the known pairs of these objects, with --because.
 clashes.because TEXT: Why --accept accepts; '' takes it back.
 clashes.rules TOML: Rules of the database from now on, instead of its own.
@@ -176,10 +175,9 @@ clashes.to DEG: Degrees: end of --turn.
 distance.a A: An object, by id or name, or several, such as 'wheel*'.
 distance.b B: Another one, or several.
 
-extract.parts WORDS...: As 'hapticdb objects' lists them: 7 or 3,4, 'wheel*', attribute=value.
 extract.disassemble: Take off what blocks the parts first, step by step.
 extract.depth N [3]: Most objects that wait for one another, beside the parts.
-extract.keep WORDS: Objects that are never taken off; as for --exclude.
+extract.keep WORDS: Objects that are never taken off.
 extract.seconds S [60; 600 with --disassemble]: Time of the search.
 extract.seed N: Seed of the search.
 extract.motions N: Motions that the planner tries; 0: straight pulls only.
@@ -215,6 +213,8 @@ demo.points N: Points of the tool.
 """Texts by name, or by verb and name: ``name VALUE [default]: help``. VALUE is absent from flags
 and choices. A length is read in the unit after its slash unless it has its own; its verb gets
 metres."""
+SIZES: dict[str | None, Callable[[str], object]] = {"VOLUME": volume_of, "SIZE": size_of}
+"""Parsers by placeholders."""
 _ALSO = {"serve": "view", "sample": "demo", "demo": "sample"}
 """Verbs with the texts of another verb as well."""
 _ENTRY = re.compile(r"^([a-z_.]+)(?: ([^\[\n]+?))?(?: \[([^]]*)\])?:\s((?:.|\n  )*)", re.MULTILINE)
@@ -271,8 +271,12 @@ def _documented(verb: str, parameter: Parameter, *, is_option: bool) -> Paramete
         parse, such = (length_of, "0.2in") if value == "LENGTH" else (point_of, "0,5,0.2in")
         words = f"{NAMES[unit].capitalize()}, or such as {such}: {words}"
         parser = _unless_read(partial(parse, unit=unit))
-    elif value == "VOLUME":
-        parser = _unless_read(volume_of)
+    elif value in SIZES:
+        parser = _unless_read(SIZES[value])
+    elif value and value.startswith("WORDS"):
+        words = f"{words[:-1]}: 7 or 3,4, 'wheel*', attribute=value."
+    if is_option and str(parameter.annotation).startswith("list"):
+        words += " Give it again for more."
     if not is_option:
         info = typer.Argument(metavar=value, help=words)
     else:

@@ -57,18 +57,11 @@ def point_of(text: str, unit: str) -> Point:
         ) from None
 
 
-def budget_bytes(mib: float) -> int:
-    """Bytes of ``--budget``, given in MiB."""
-    if not 1.0 <= mib <= LARGEST_MIB:
-        raise UsageError(f"--budget {mib}: give MiB, 1 to a million")
-    return int(mib * MIB)
-
-
-def size_bytes(text: str, option: str) -> int:
+def size_of(text: str) -> int:
     """Bytes of a size in MiB, or with its own unit, such as ``4GiB``."""
     match = SIZE.fullmatch(text.strip())
     unit = (match[2] or "M")[0].upper() if match else "M"
     mib = float(match[1]) * (1024.0 if unit == "G" else 1.0) if match else 0.0
     if not 1.0 <= mib <= LARGEST_MIB:
-        raise UsageError(f"{option} {text[:80]!r}: give MiB, 1 to a million, or such as 4GiB")
+        raise UsageError(f"{text[:80]!r}: give MiB, 1 to a million, or such as 4GiB")
     return int(mib * MIB)

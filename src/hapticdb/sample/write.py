@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticdb.errors import FileError, UsageError
+from hapticdb.tabular.tables import new_file
 
 
 class SampleFiles(NamedTuple):
@@ -36,14 +37,8 @@ def _content(name: str) -> bytes:
 
 def _write(path: Path, content: bytes) -> Path:
     """Write a file atomically."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_bytes(content)
-        partial.replace(path)
-    except OSError as error:
-        raise FileError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with new_file(path, "sample", replaces=True) as part:
+        part.write_bytes(content)
     return path
 
 

@@ -11,7 +11,7 @@ import hapticdb
 from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.emit import TableOutput, new_files, open_csv
-from hapticdb.cli.values import Point, budget_bytes, refuse
+from hapticdb.cli.values import MIB, Point, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import AXES, plain
 from hapticdb.units import length_text, place_text
@@ -74,7 +74,7 @@ class PairOptions:
     against: list[str] | None = None
     kind: list[str] | None = None
     seconds: float | None = None
-    budget: float = 256.0
+    budget: int = 256 * MIB
     on: str | None = None
 
     @property
@@ -154,7 +154,7 @@ def clashes(
             found = hapticdb.find_clashes(
                 env, within=pairs.within, contact=pairs.contact, of=pairs.of or (),
                 against=pairs.against or (), on=pairs.on, seconds=pairs.seconds,
-                budget=budget_bytes(pairs.budget), progress=progress)  # fmt: skip
+                budget=pairs.budget, progress=progress)  # fmt: skip
         with env.store.snapshot():  # others may remove objects meanwhile
             if meant.least_volume is not None:
                 from hapticdb.clashes.volumes import with_volumes

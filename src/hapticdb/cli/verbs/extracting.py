@@ -11,7 +11,7 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.choosing import FilterOptions, ids_of
 from hapticdb.cli.emit import Output
-from hapticdb.cli.values import budget_bytes, numbers_of, point_of, refuse
+from hapticdb.cli.values import MIB, numbers_of, point_of, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import plain
 from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
@@ -109,13 +109,13 @@ class _Output(Output):
 
 def extract(
     url: str,
-    parts: list[str],
+    objects: list[str],
     *,
     order: OrderOptions,
     to: str | None = None,
     search: SearchOptions,
     felt: FilterOptions,
-    budget: float = 256.0,
+    budget: int = 256 * MIB,
     output: _Output,
 ) -> None:
     """See `HELP`."""
@@ -127,13 +127,13 @@ def extract(
         refuse("with --to", order, "disassemble")
         refuse("with --to", search, "out screw")
     goal = _goal(to) if to else None
-    options: dict[str, Any] = vars(search) | {"budget_bytes": budget_bytes(budget)}
+    options: dict[str, Any] = vars(search) | {"budget_bytes": budget}
     options |= {"depth": order.depth} if order.disassemble else {"to": goal}
     options = {name: value for name, value in options.items() if value is not None}
     found: Extraction | Disassembly
     steps: list[tuple[Extraction, Sequence[int]]]
     with hapticdb.open(url, read_only=True) as env:
-        ids = ids_of(env, parts, "WORDS")
+        ids = ids_of(env, objects, "WORDS")
         chosen = felt.felt(env, ids)
         kept = ids_of(env, order.keep, "--keep") if order.keep else []
         with render.bar("pulling", "searches" if order.on else "pulls") as progress:

@@ -18,7 +18,7 @@ from hapticdb.cli.hands import HandOptions
 from hapticdb.cli.options import FramesOn, LawName, RenderingName
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.cli.tools import ToolOptions
-from hapticdb.cli.values import budget_bytes, refuse, size_bytes
+from hapticdb.cli.values import MIB, refuse
 
 if TYPE_CHECKING:
     from hapticdb.devices.profiles import DeviceProfile
@@ -72,18 +72,17 @@ class RecordOptions:
 
     record: str | None = None
     replace: bool = False
-    record_limit: str | None = None
+    record_limit: int | None = None
 
     def settled(self) -> dict[str, Any]:
         """Arguments of a session; UsageError for options of a recording without one."""
         from hapticdb.recording.file import DEFAULT_LIMIT
 
-        limit = self.record_limit
-        bytes_ = DEFAULT_LIMIT if limit is None else size_bytes(limit, "--record-limit")
         if self.record is None:
             refuse("without --record", self)
         return {
-            "record": self.record, "replace_recording": self.replace, "record_limit_bytes": bytes_
+            "record": self.record, "replace_recording": self.replace,
+            "record_limit_bytes": self.record_limit or DEFAULT_LIMIT,
         }  # fmt: skip
 
 
@@ -106,7 +105,7 @@ def feel(
     felt: FilterOptions,
     force: ForceOptions,
     recorded: RecordOptions,
-    budget: float = 256.0,
+    budget: int = 256 * MIB,
     no_baseline: bool = False,
     output: Output,
 ) -> None:
@@ -130,7 +129,7 @@ def feel(
         handle=hapticdb.Handle(scale=hand.scale, clutch=hand.clutch), coupling=coupling,
         has_baseline=not no_baseline, **vars(loop), **recording,
     )  # fmt: skip
-    with _begun(begin, url, budget_bytes(budget), found, force.law) as session:
+    with _begun(begin, url, budget, found, force.law) as session:
         with ended_by_signals(session.ask_to_end) as signals:
             report = _waited_for(session, force.stiffness, loop.seconds)
         page = session_page.SessionPage(report, session.cells, shell, recorded.record, path_speed)

@@ -90,11 +90,11 @@ def import_(
         raise UsageError(f"{url} is a file to import; the environment is first: {env} {url}")
     if grid.partitions is not None:
         url = with_partitions(url, grid.partitions)
-    memory = None if reading.memory_limit is None else reading.memory_limit << 20
     options = ImportOptions(
         unit=reading.unit, layout=grid.layout, jobs=reading.jobs, on=reading.on,
         grid=GridOptions(grid.bits, grid.voxel_size, grid.extent, grid.origin, grid.curve),
-        keep_removed=keep_removed, time_limit=reading.time_limit, memory_limit=memory,
+        keep_removed=keep_removed, time_limit=reading.time_limit,
+        memory_limit=reading.memory_limit,
         replace=replace, distances=grid.distances, skip_unusable=True, chord=reading.chord,
         voxel_limit=reading.voxel_limit,
     )  # fmt: skip

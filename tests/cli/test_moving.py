@@ -9,7 +9,7 @@ import pytest
 import hapticdb
 from command_line import Run, on_terminal, refused, succeeded
 from hapticdb import Grid
-from hapticdb.cli.verbs import moving
+from hapticdb.cli import render
 from hapticdb.store.base import Object, Rows
 from hapticdb.store.sqlite.tables.file_tables import FileTables
 from voxels import write_voxels
@@ -69,13 +69,13 @@ def test_differences_are_told_a_line_each(run: Run, scene: Path) -> None:
 def test_many_differences_are_cut_and_counted(run: Run, scene: Path) -> None:
     assert run("copy", scene, "b.db")[0] == 0
     with hapticdb.open("b.db") as env:
-        for n in range(2 * moving.MOST_LINES):
+        for n in range(2 * render.MOST_ROWS):
             write_voxels(env.store, np.array([[1, 2, 3]]), f"new {n}")
     code, out, _ = run("diff", scene, "b.db")
     lines = out.splitlines()
     assert code == 1
-    assert len(lines) == moving.MOST_LINES + 4
-    cut = f"{2 * moving.MOST_LINES} differences, {moving.MOST_LINES} of them shown"
+    assert len(lines) == render.MOST_ROWS + 4
+    cut = f"{2 * render.MOST_ROWS} differences, {render.MOST_ROWS} of them shown"
     assert lines[-1].startswith(cut)
 
 

@@ -11,6 +11,7 @@ import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 from unicodedata import category, east_asian_width
@@ -31,6 +32,8 @@ ASCII = {"─": "-", "…": "...", "µ": "u", "±": "+-", "³": "3"}
 """Replacements of our own characters, for encodings without them."""
 NARROW = 12
 """Least width of a shortened text, columns."""
+MOST_ROWS = 20
+"""Rows of a long table; further ones are counted below it."""
 GAP, NARROW_GAP, FACTS_GAP = 3, 1, 2
 """Blanks between two columns of a table, of a shortened one, and between a name and its value."""
 
@@ -80,11 +83,22 @@ def say_json(result: object) -> None:
     print(json.dumps(plain(result), allow_nan=False))
 
 
-def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+def table(
+    headings: Sequence[str], rows: Iterable[Sequence[object]], of: int = 0, nouns: str = "rows"
+) -> None:
     """Print rows under headings, or each row as facts on a terminal too narrow for columns.
 
-    ``>`` at a heading's end marks a column of numbers, ``?`` one omitted first.
+    ``>`` at a heading's end marks a column of numbers, ``?`` one omitted first. of : number of all
+    rows, if only `MOST_ROWS` are shown. Without rows nothing is printed.
     """
+    shown = [[*map(str, row)] for row in islice(rows, MOST_ROWS if of else None)]
+    if shown:
+        _print_table(headings, shown)
+    if of > MOST_ROWS:
+        say(f"{MOST_ROWS} of {of:,} {nouns}")
+
+
+def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     columns = [*zip(headings, *rows, strict=True)]
     while True:
         numbers = [one[0].rstrip("?").endswith(">") for one in columns]

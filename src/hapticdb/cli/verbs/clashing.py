@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.exact.moving_clash import Meeting
 
-MOST_ROWS = 20
-"""Rows of the table of groups or pairs; further ones are counted below it."""
 NOT_DECIDED = 3
 """Exit code of a search without a clash, but with pairs not yet measured."""
 MEETINGS = ("id", "name", "begin", "end", "kind", "at_least", "place")
@@ -238,11 +236,10 @@ def _moved(url: str, pairs: PairOptions, motion: TurnOptions, output: _Output) -
         told = [one for one in _meetings(url, pairs, motion) if not kinds or one.kind in kinds]
         output.add(table, *map(plain, told))
     if output.has_words:
-        rows = [(str(one.id), one.name, f"{one.begin:.4g}", f"{one.end:.4g}", one.kind,
+        rows = [(one.id, one.name, f"{one.begin:.4g}", f"{one.end:.4g}", one.kind,
                  length_text(one.at_least) if one.at_least else "-") for one in told]  # fmt: skip
         unit = "pose" if motion.turn is None else "degrees"
-        if rows:
-            render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
+        render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
         render.say(f"{render.counted(len(told), 'meeting')} on the way")
     return int(any(one.kind in (kinds or ASKED) for one in told))
 
@@ -308,16 +305,13 @@ def _say_accepted(pairs: list[tuple[int, int]], because: str, output: _Output) -
 def _show_groups(groups: "list[Group]") -> None:
     """Print the gravest open groups, and the number of closed ones."""
     shown = [one for one in groups if one.is_open]
-    rows = [
+    rows = (
         (one.id, one.kind, f"{len(one.pairs):,}", f"{one.n_parts:,}", one.length_text(),
          _millimetres(one.pairs[0].place), one.status(), one.title())
-        for one in shown[:MOST_ROWS]
-    ]  # fmt: skip
-    if rows:
-        headings = ("group>", "are", "pairs>", "parts>?", "by>", "at, mm?", "status", "which")
-        render.table(headings, rows)
-    if len(shown) > MOST_ROWS:
-        render.say(f"{len(shown):,} groups, {MOST_ROWS} of them shown; --csv writes all pairs")
+        for one in shown
+    )  # fmt: skip
+    headings = ("group>", "are", "pairs>", "parts>?", "by>", "at, mm?", "status", "which")
+    render.table(headings, rows, len(shown), "groups; --csv writes all pairs")
     if len(shown) < len(groups):
         count = render.counted(len(groups) - len(shown), "group")
         render.say(f"{count} meant or accepted: --all shows all pairs")
@@ -329,26 +323,21 @@ def _millimetres(place: tuple[float, ...] | None) -> str:
 
 def _show_pairs(told: "list[Clash]") -> None:
     """Print the gravest pairs."""
-    rows = [
-        (str(one.a), one.a_name or "(gone)", str(one.b), one.b_name or "(gone)", one.kind,
+    rows = (
+        (one.a, one.a_name or "(gone)", one.b, one.b_name or "(gone)", one.kind,
          one.length_text(), one.because or one.status)
-        for one in told[:MOST_ROWS]
-    ]  # fmt: skip
-    if rows:
-        render.table(("id>", "object", "id>", "and", "are", "by>", "status"), rows)
-    if len(told) > MOST_ROWS:
-        render.say(f"{len(told):,} pairs, {MOST_ROWS} of them shown; --csv writes all")
+        for one in told
+    )  # fmt: skip
+    headings = ("id>", "object", "id>", "and", "are", "by>", "status")
+    render.table(headings, rows, len(told), "pairs; --csv writes all")
 
 
 def _show_facts(found: "Clashes", groups: "list[Group]") -> None:
     """Print the reach of each rule, and the numbers of groups and pairs of each kind."""
     from hapticdb.clashes.rules import rule_text
 
-    reached = [
-        (str(n), rule_text(one.rule), str(one)) for n, one in enumerate(found.reach(), start=1)
-    ]
-    if reached:
-        render.table(("rule>", "says", "reaches"), reached)
+    reached = ((n, rule_text(one.rule), one) for n, one in enumerate(found.reach(), start=1))
+    render.table(("rule>", "says", "reaches"), reached)
     counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n)
     statuses = ", ".join(f"{n:,} {status}" for status, n in sorted(found.statuses().items()))
     kinds = Counter[str](group.kind for group in groups if group.is_open)

@@ -211,11 +211,11 @@ def _show(found: "Extraction") -> list[tuple[str, str]]:
     """Print the blockers; returns the figures of the search."""
     from hapticdb.exact.report import names_of
 
-    if found.way is None and found.blockers:
-        rows = [
-            (str(one.object.id), one.object.name, f"{one.pulls} of {found.pulls}")
+    if found.way is None:
+        rows = (
+            (one.object.id, one.object.name, f"{one.pulls} of {found.pulls}")
             for one in found.blockers[:MOST_BLOCKERS]
-        ]
+        )
         render.table(("id>", "in the way", "of pulls>"), rows)
     pulls, motions, poses = (
         render.counted(n, noun)
@@ -234,10 +234,10 @@ def _show_order(found: "Disassembly") -> list[tuple[str, str]]:
 
     for n, step in enumerate(found.steps):
         render.say(f"{n + 1}. {names_of(step.found.parts)}: {extraction_line(step.found)}")
-    if not found.is_found and found.failed:
-        rows = [
-            (names_of(one.parts), str(one.n_gone), failed_line(one))
+    if not found.is_found:
+        rows = (
+            (names_of(one.parts), one.n_gone, failed_line(one))
             for one in found.failed[-MOST_BLOCKERS:]
-        ]
+        )
         render.table(("tried", "after steps>", "result"), rows)
     return [("took", f"{found.seconds:.1f} s")]

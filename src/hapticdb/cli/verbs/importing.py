@@ -53,6 +53,8 @@ class ReadingOptions:
     time_limit: float | None = None
     memory_limit: int | None = None
     voxel_limit: int | None = None
+    replace: bool = False
+    keep_removed: bool = False
 
 
 def import_(
@@ -61,8 +63,6 @@ def import_(
     *,
     grid: NewGridOptions,
     reading: ReadingOptions,
-    replace: bool = False,
-    keep_removed: bool = False,
     output: Output,
 ) -> None:
     """Import CAD files and point clouds.
@@ -91,12 +91,8 @@ def import_(
     if grid.partitions is not None:
         url = with_partitions(url, grid.partitions)
     options = ImportOptions(
-        unit=reading.unit, layout=grid.layout, jobs=reading.jobs, on=reading.on,
         grid=GridOptions(grid.bits, grid.voxel_size, grid.extent, grid.origin, grid.curve),
-        keep_removed=keep_removed, time_limit=reading.time_limit,
-        memory_limit=reading.memory_limit,
-        replace=replace, distances=grid.distances, skip_unusable=True, chord=reading.chord,
-        voxel_limit=reading.voxel_limit,
+        layout=grid.layout, distances=grid.distances, skip_unusable=True, **vars(reading),
     )  # fmt: skip
     started = time.perf_counter()
     reports = _imported(url, files, options)

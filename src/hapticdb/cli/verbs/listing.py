@@ -145,9 +145,7 @@ def objects(
         for obj in shown:
             render.say_json(record(obj, OBJECT))
     elif found:
-        rows = [
-            (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in shown
-        ]
+        rows = ((o.id, o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in shown)
         render.table(("id>", "name", "voxels>", "size, mm>", "file?"), rows)
         if len(shown) < len(found):
             render.note(f"{len(shown):,} of {len(found):,} objects; --limit 0 shows all")

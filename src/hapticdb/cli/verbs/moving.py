@@ -22,8 +22,6 @@ KINDS = {
     "voxels": "other voxels", "distances": "other distances",
 }  # fmt: skip
 """Fields of a `Difference`, the most important first, with their words for an object."""
-MOST_LINES = 20
-"""Rows of the table of differences; further ones are counted."""
 
 
 def copy(
@@ -130,12 +128,13 @@ def _show(found: "Difference", told: list[dict[str, Any]]) -> None:
             f"{found.b}"
         )
     rows = []
-    for one in told[:MOST_LINES]:
+    for one in told[: render.MOST_ROWS]:
         way = one.get("farthest_corner")
         moved = f"{length_text(way)} ({way / size:.3g} voxels)" if way else ""
-        rows.append((str(one["id"]), one["name"], one["what"], moved, one["link"]))
+        rows.append((one["id"], one["name"], one["what"], moved, one["link"]))
+    render.table(("id>", "name", "what", "moved by>", "file?"), rows)
     if rows:
-        render.table(("id>", "name", "what", "moved by>", "file?"), rows)
         render.say(f"A: {found.a}; B: {found.b}")
     count = render.counted(len(told) + (not found.is_same_grid), "difference")
-    render.say(count + (f", {MOST_LINES} of them shown" if len(told) > MOST_LINES else ""), 1)
+    cut = f", {render.MOST_ROWS} of them shown" if len(told) > render.MOST_ROWS else ""
+    render.say(count + cut, 1)

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from hapticdb.exact.swept import Swept
     from hapticdb.pointshell.shell import PointShell
 
-MOST_OBJECTS = 20
-"""Rows of the table of hits and contacts; the other objects are counted below it."""
 HELP = f"""Check whether a tool or part is free along a path.
 
 Clear by a gap: no surface meets the tool's. Slides: it moves along what it touches where the path
@@ -219,12 +217,12 @@ def _show(told: _Told) -> None:
     found = told.found
     render.say(verdict_line(found, told.shell), found.verdict.exit_status)
     rows = [
-        (str(place.object.id), place.object.name, "hit", f"at {percent(place.fraction)}", "", "")
+        (place.object.id, place.object.name, "hit", f"at {percent(place.fraction)}", "", "")
         for place in found.hits
     ]
     rows += [
         (
-            str(one.object.id),
+            one.object.id,
             one.object.name,
             "touched",
             until_text(one.until).removesuffix(" of the path"),
@@ -233,11 +231,8 @@ def _show(told: _Told) -> None:
         )
         for one in found.touching
     ]
-    if rows:
-        columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
-        render.table(columns, rows[:MOST_OBJECTS])
-        if len(rows) > MOST_OBJECTS:
-            render.say(f"{len(rows)} rows, {MOST_OBJECTS} of them shown")
+    columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
+    render.table(columns, rows, len(rows))
     poses = render.counted(len(found.path.poses), "pose")
     facts = [("path", f"{poses}, {length_text(found.path.length)}")]
     if found.is_free:

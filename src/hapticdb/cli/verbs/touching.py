@@ -221,9 +221,6 @@ class _Summary:
             ("strategy", render.shares(self.strategies)),
             ("objects", f"{len(self.objects)} touched"),
         ])  # fmt: skip
-        if self.objects:
-            ranked = sorted(self.frames_of.items(), key=lambda item: (-item[1], item[0]))
-            render.table(
-                ("id>", "touched most", "frames>"),
-                [(str(i), self.objects[i].name, str(n)) for i, n in ranked[:MOST_TOUCHED]],
-            )
+        ranked = sorted(self.frames_of.items(), key=lambda item: (-item[1], item[0]))
+        rows = ((i, self.objects[i].name, n) for i, n in ranked[:MOST_TOUCHED])
+        render.table(("id>", "touched most", "frames>"), rows)

@@ -171,7 +171,7 @@ def test_a_turn_and_a_path_say_when_parts_meet(run: Run, tmp_path: Path) -> None
     code, out, _ = run("clashes", path, "--of", "cube0", "--poses", tmp_path / "way.csv")
     assert (code, out) == (0, "0 meetings on the way\n")
     refused(run("clashes", path, "--turn", "z"), "--of")
-    for more in ("--least-volume 1", "--all", "--within 2", "--budget 0", "--junit a.xml"):
+    for more in ("--least-volume 1", "--all", "--within 2", "--budget 9", "--junit a.xml"):
         words = ("--of", "cube0", "--turn", "z", *more.split())
         refused(run("clashes", path, *words), more.split()[0], "with --poses and --turn")
     for more in ("--from 1", "--about 0,0,0"):

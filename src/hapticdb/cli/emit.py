@@ -73,7 +73,7 @@ def open_csv(
             stream = stack.enter_context(part.open("w", encoding="utf-8", newline=""))
         made = CsvWriter(stream, keys)
         yield made
-        made.finish()
+        made.add()
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any
 
@@ -10,6 +10,7 @@ import typer
 import typer.core
 
 from hapticdb import interrupting
+from hapticdb.cli.render import note
 
 
 class Interrupted(Exception):  # noqa: N818 - no error: the user pressed Ctrl-C
@@ -73,8 +74,13 @@ def leave(number: int, _: object) -> None:
     raise SystemExit(128 + number)
 
 
-TERMINATED = 128 + signal.SIGTERM
-"""Exit code of a verb after SIGTERM and its clean-up."""
+def exit_by(signals: Sequence[int], after: str = "") -> None:
+    """Exit with the code of the signal that ended a verb's work, if one did."""
+    if signal.SIGTERM in signals:
+        note(f"ended by SIGTERM{after}")
+        leave(signal.SIGTERM, None)
+    if signals:
+        raise Interrupted(f"ended by Ctrl-C{after}")
 
 
 def _show_version(*, wanted: bool) -> None:

@@ -97,7 +97,7 @@ class CsvWriter:
         self._is_begun = False
 
     def add(self, *records: Mapping[str, Any]) -> None:
-        """Add a row for each record; columns of missing keys stay empty."""
+        """Add a row for each record, or the header alone; columns of missing keys stay empty."""
         self.write(columns_of(self._keys, records))
 
     def write(self, columns: Columns) -> None:
@@ -106,11 +106,6 @@ class CsvWriter:
             self._writer.writerow(columns)
             self._is_begun = True
         self._writer.writerows(zip(*map(_cells, columns.values()), strict=True))
-
-    def finish(self) -> None:
-        """Write the header of a table without rows."""
-        if not self._is_begun:
-            self.add()
 
 
 def _cells(column: Any) -> list[object]:  # noqa: ANN401 - one of `Columns`
@@ -153,13 +148,11 @@ def open_table(
             "name that ends with .npz or .csv"
         )
     with new_file(target, option, replaces=replaces) as part:
-        opened = {".csv": _csv_rows, ".parquet": _row_groups, ".npz": _arrays}[target.suffix]
-        yield from opened(part)
-
-
-def _csv_rows(path: Path) -> Iterator[Callable[[Columns], None]]:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        yield CsvWriter(file).write
+        if target.suffix == ".csv":
+            with part.open("w", encoding="utf-8", newline="") as file:
+                yield CsvWriter(file).write
+        else:
+            yield from _row_groups(part) if target.suffix == ".parquet" else _arrays(part)
 
 
 def _row_groups(path: Path) -> Iterator[Callable[[Columns], None]]:
@@ -168,13 +161,13 @@ def _row_groups(path: Path) -> Iterator[Callable[[Columns], None]]:
     from pyarrow import parquet  # noqa: PLC0415
 
     with ExitStack() as opened:
-        writers: list[parquet.ParquetWriter] = []
+        writer = None
 
         def write(columns: Columns) -> None:
+            nonlocal writer
             table = pa.table(dict(columns))
-            if not writers:
-                writers.append(opened.enter_context(parquet.ParquetWriter(path, table.schema)))
-            writers[0].write_table(table)
+            writer = writer or opened.enter_context(parquet.ParquetWriter(path, table.schema))
+            writer.write_table(table)
 
         yield write
 

@@ -115,11 +115,6 @@ class _Output(TableOutput):
     junit: str | None = None
     bcf: str | None = None
 
-    @property
-    def reports(self) -> dict[str, str | None]:
-        """Files of reports by option."""
-        return {"html": self.html, "junit": self.junit, "bcf": self.bcf}
-
 
 def clashes(
     url: str, *, pairs: PairOptions, meant: RuleOptions, motion: TurnOptions, output: _Output
@@ -132,19 +127,26 @@ def clashes(
     if meant.accept is not None or (because is not None and meant.group is None):
         refuse("with --accept", pairs)
         refuse("with --accept", meant, "rules rule group all_ least_volume")
-        raise typer.Exit(_accept(url, meant.accept, because, output))
+        if meant.accept is None or because is None:
+            raise UsageError("--accept A B and --because TEXT: give both, or neither")
+        a, b = meant.accept
+        with hapticdb.open(url) as env:
+            rows = hapticdb.accept_clash(env, [a], [b], because or None)
+        _say_accepted([(row.a, row.b) for row in rows], because, output)
+        return
     if motion.poses is not None or motion.turn is not None:
         refuse("with --poses and --turn", pairs, "within seconds budget on")
         refuse("with --poses and --turn", meant)
         refuse("with --poses and --turn", output, "html junit bcf")
-        raise typer.Exit(_moved(url, pairs, motion, output))
+        _moved(url, pairs, motion, output)
     refuse("without --poses and --turn", motion)
     from hapticdb.clashes.result import PAIR_KEYS
     from hapticdb.clashes.rules import add_rules
+    from hapticdb.clashes.run import accept_pairs
 
     with (
         open_csv(output.csv, (*PAIR_KEYS, "group")) as table,
-        new_files(**output.reports) as files,
+        new_files(html=output.html, junit=output.junit, bcf=output.bcf) as files,
         opened_to_keep(url) as env,
     ):
         add_rules(env.store, meant.rule or (), pairs.within, meant.rules)
@@ -164,7 +166,9 @@ def clashes(
 
                 write_reports(files, env, found, told.pairs, told.groups, kinds)
         if because is not None:
-            raise typer.Exit(told.accept(env, because, output))
+            accept_pairs(env.store, [*told.ids], found.known, because or None)
+            _say_accepted([*told.ids], because, output)
+            return
         if table is not None:
             table.add(*told.records())
     told.say(url, output, is_grouped=meant.group is None and not meant.all_)
@@ -199,14 +203,6 @@ class _Told(NamedTuple):
         ids = {(one.a, one.b): found.id for found in groups for one in found.pairs}
         return cls(found, pairs, groups, ids)
 
-    def accept(self, env: "Environment", because: str, output: _Output) -> int:
-        """Accept the pairs, or revoke that if the reason is empty; returns the exit code."""
-        from hapticdb.clashes.run import accept_pairs
-
-        pairs = [(one.a, one.b) for one in self.pairs]
-        accept_pairs(env.store, pairs, self.found.known, because or None)
-        return _say_accepted(pairs, because, output)
-
     def records(self) -> Iterator[dict[str, Any]]:
         """Records of the pairs, with their groups."""
         for one in self.pairs:
@@ -227,8 +223,8 @@ class _Told(NamedTuple):
             render.note(f"{url} can only be read by this user: what was found is not kept")
 
 
-def _moved(url: str, pairs: PairOptions, motion: TurnOptions, output: _Output) -> int:
-    """Print the meetings of moving parts with others; returns the exit code."""
+def _moved(url: str, pairs: PairOptions, motion: TurnOptions, output: _Output) -> None:
+    """Print the meetings of moving parts with others, and exit."""
     from hapticdb.clashes.result import ASKED
 
     kinds = pairs.kinds
@@ -241,7 +237,7 @@ def _moved(url: str, pairs: PairOptions, motion: TurnOptions, output: _Output) -
         unit = "pose" if motion.turn is None else "degrees"
         render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
         render.say(f"{render.counted(len(told), 'meeting')} on the way")
-    return int(any(one.kind in (kinds or ASKED) for one in told))
+    raise typer.Exit(int(any(one.kind in (kinds or ASKED) for one in told)))
 
 
 def _meetings(url: str, pairs: PairOptions, motion: TurnOptions) -> "list[Meeting]":
@@ -284,22 +280,11 @@ def _exit_code(found: "Clashes", kinds: tuple[Kind, ...]) -> int:
     return NOT_DECIDED if found.left else 0
 
 
-def _accept(url: str, pair: tuple[str, str] | None, because: str | None, output: _Output) -> int:
-    from hapticdb.clashes.run import accept_clash
-
-    if pair is None or because is None:
-        raise UsageError("--accept A B and --because TEXT: give both, or neither")
-    with hapticdb.open(url) as env:
-        rows = accept_clash(env, [pair[0]], [pair[1]], because or None)
-    return _say_accepted([(row.a, row.b) for row in rows], because, output)
-
-
-def _say_accepted(pairs: list[tuple[int, int]], because: str, output: _Output) -> int:
+def _say_accepted(pairs: list[tuple[int, int]], because: str, output: _Output) -> None:
     output.add(None, *({"a": a, "b": b, "because": because or None} for a, b in pairs))
     if not output.json:
         what = "accepted until a part changes its shape" if because else "no longer accepted"
         render.say(f"{render.counted(len(pairs), 'pair')} {what}")
-    return 0
 
 
 def _show_groups(groups: "list[Group]") -> None:

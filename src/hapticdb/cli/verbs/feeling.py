@@ -1,8 +1,6 @@
 """The verb feel."""
 
-import signal
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
@@ -12,11 +10,11 @@ import typer
 
 import hapticdb
 from hapticdb.cli import render, session_page
-from hapticdb.cli.choosing import Felt, FilterOptions
+from hapticdb.cli.choosing import FilterOptions
 from hapticdb.cli.emit import Output
 from hapticdb.cli.hands import HandOptions
 from hapticdb.cli.options import FramesOn, LawName, RenderingName
-from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
+from hapticdb.cli.root import ended_by_signals, exit_by
 from hapticdb.cli.tools import ToolOptions
 from hapticdb.cli.values import MIB, refuse
 
@@ -124,34 +122,25 @@ def feel(
         found = felt.felt(env)
         shell = tool.made(env, law, found.left_out).shell
     session_page.tell_cost(len(shell), loop.rate, law, loop.frames_on)
-    begin = partial(
-        hapticdb.Session, shell=shell, device=device, law=chosen, rendering=rendering,
-        handle=hapticdb.Handle(scale=hand.scale, clutch=hand.clutch), coupling=coupling,
-        has_baseline=not no_baseline, **vars(loop), **recording,
-    )  # fmt: skip
-    with _begun(begin, url, budget, found, force.law) as session:
+    doing = "starting" if no_baseline else "measuring an empty loop, then starting"
+    with ExitStack() as held:
+        with render.bar(doing, ""):
+            cells = held.enter_context(hapticdb.ResidentCells(
+                url, budget_bytes=budget, where=found.where, exclude=found.exclude,
+                distances=None if force.law is None else force.law == "distance",
+            ))  # fmt: skip
+            session = held.enter_context(hapticdb.Session(
+                cells, shell, device, law=chosen, rendering=rendering, coupling=coupling,
+                handle=hapticdb.Handle(scale=hand.scale, clutch=hand.clutch),
+                has_baseline=not no_baseline, **vars(loop), **recording,
+            ))  # fmt: skip
         with ended_by_signals(session.ask_to_end) as signals:
             report = _waited_for(session, force.stiffness, loop.seconds)
         page = session_page.SessionPage(report, session.cells, shell, recorded.record, path_speed)
         output.emit(page.record(), partial(page.show, began))
-    _exit_after(signals, report)
-
-
-@contextmanager
-def _begun(
-    begin: "partial[Session]", url: str, budget_bytes: int, felt: Felt, law: LawName | None
-) -> "Iterator[Session]":
-    """Begin a session; its resident cells have distances if the law reads them."""
-    is_measured = begin.keywords["has_baseline"]
-    doing = "measuring an empty loop, then starting" if is_measured else "starting"
-    with ExitStack() as held:
-        with render.bar(doing, ""):
-            cells = held.enter_context(hapticdb.ResidentCells(
-                url, budget_bytes=budget_bytes, where=felt.where, exclude=felt.exclude,
-                distances=None if law is None else law == "distance",
-            ))  # fmt: skip
-            session = held.enter_context(begin(cells))
-        yield session
+    exit_by(signals, f" after {report.loop.seconds:.3g} s")
+    if report.database_lost is not None or report.stale_frames:
+        raise typer.Exit(1)
 
 
 def _begin_loop(force: ForceOptions, loop: LoopOptions) -> "Rendering":
@@ -175,20 +164,6 @@ def _begin_loop(force: ForceOptions, loop: LoopOptions) -> "Rendering":
 
     Timing(processor=loop.processor)
     return chosen
-
-
-def _exit_after(signals: Sequence[int], report: "Report") -> None:
-    """Exit with the code of the signal that ended the session.
-
-    Without a signal: 1 if the database was lost at the end, or so long that frames had no force.
-    """
-    if signal.SIGTERM in signals:
-        render.note(f"ended by SIGTERM after {report.loop.seconds:.3g} s")
-        raise typer.Exit(TERMINATED)
-    if signals:
-        raise Interrupted(f"ended by Ctrl-C after {report.loop.seconds:.3g} s")
-    if report.database_lost is not None or report.stale_frames:
-        raise typer.Exit(1)
 
 
 def _waited_for(session: "Session", stiffness: float | None, seconds: float | None) -> "Report":

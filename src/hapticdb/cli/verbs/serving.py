@@ -1,17 +1,14 @@
 """The verbs view and serve."""
 
-import signal
 import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from hapticdb.cli import render
 from hapticdb.cli.options import RenderingName
-from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
+from hapticdb.cli.root import ended_by_signals, exit_by
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
 if TYPE_CHECKING:
@@ -220,8 +217,4 @@ def _run(
     level = logging.WARNING if is_quiet else logging.INFO
     with logs.written("json" if log_json else "plain", level):
         signals = asyncio.run(work())
-    if signal.SIGTERM in signals:
-        render.note("ended by SIGTERM")
-        raise typer.Exit(TERMINATED)
-    if signals:
-        raise Interrupted("ended by Ctrl-C")
+    exit_by(signals)

@@ -49,6 +49,9 @@ if TYPE_CHECKING:
     from hapticdb.ingest.files import FileReport as FileReport
     from hapticdb.ingest.files import ImportOptions as ImportOptions
     from hapticdb.ingest.files import import_files as import_files
+    from hapticdb.machines.machine import Machine as Machine
+    from hapticdb.machines.reader import read_machine as read_machine
+    from hapticdb.machines.sweep import sweep_machine as sweep_machine
     from hapticdb.paper.cost_model import CostModel as CostModel
     from hapticdb.paper.quantiles import QuantileVector as QuantileVector
     from hapticdb.pointshell.shell import PointShell as PointShell

@@ -130,13 +130,18 @@ def test_an_edit_of_the_file_or_of_the_sources_makes_the_tool_anew(
     assert is_read()
 
 
+def _make_folder(entry: Path) -> None:
+    entry.unlink()
+    entry.mkdir()
+
+
 def test_a_damaged_entry_is_made_anew(file: Path, is_read: Callable[[], bool]) -> None:
     before = tool(file)
     damages: list[Callable[[Path], object]] = [
         lambda entry: entry.write_bytes(b""),
         lambda entry: entry.write_bytes(entry.read_bytes()[:-8]),
         lambda entry: entry.write_bytes(entry.read_bytes()[:-1] + b"!"),
-        lambda entry: (entry.unlink(), entry.mkdir()),
+        _make_folder,
     ]
     for n, damage in enumerate(damages):
         (entry,) = entries()

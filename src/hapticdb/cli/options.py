@@ -139,6 +139,11 @@ serve.log_json: Write the log as JSON, an object a line.
 replay.recording FILE: A session's .hdbrec.
 replay.url URL: The environment; unless given, the recorded one if its file is beside FILE.
 
+sweep.machine FILE: Instead of --tool: a machine with joints, URDF, or MJCF (extra machines).
+sweep.joints CSV: Its path: a column a joint, rad or m, or a header such as 'elbow [deg]'.
+sweep.srdf FILE: Pairs of its links that are not tested.
+sweep.at POSE [the world's frame]: Where its base stands: x,y,z,qw,qx,qy,qz, millimetres, or such as
+  0,5,0.2in,1,0,0,0; or a CSV file of one pose, metres.
 sweep.part WORDS: Instead of --tool: objects that move, all together.
 sweep.path FILE: Poses, as for touch --poses.
 sweep.about X,Y,Z/mm [middle of the tool's box]: the centre of the path's turns, tool's frame.

@@ -9,7 +9,9 @@ from hapticdb.errors import UsageError
 from hapticdb.units import NAMES, length_of
 
 if TYPE_CHECKING:
+    import numpy as np
     from _typeshed import DataclassInstance
+    from numpy.typing import NDArray
 
 MIB = 1 << 20
 LARGEST_MIB = 1e6
@@ -55,6 +57,27 @@ def point_of(text: str, unit: str) -> Point:
         raise UsageError(
             f"{text[:80]!r}: give X,Y,Z in {NAMES[unit]}, or such as 0,5,0.2in"
         ) from None
+
+
+def pose_of(text: str, option: str) -> "NDArray[np.float64]":
+    """Pose (4, 4) of an option, metres: given as numbers, millimetres, or as a file, metres."""
+    import numpy as np
+
+    from hapticdb.poses import pose_of_row, read_poses
+
+    if text.lower().endswith(".csv"):
+        poses = read_poses(text)
+        if len(poses) != 1:
+            raise UsageError(f"{option} {text}: it has {len(poses)} poses, give a file of one")
+        return np.asarray(poses[0])
+    words = text.replace(",", " ").split()
+    try:
+        place = point_of(" ".join(words[:3]), "mm")
+        turn = numbers_of(" ".join(words[3:]), 4, option, "qw,qx,qy,qz")
+    except UsageError:
+        form = "x,y,z,qw,qx,qy,qz, or a file whose name ends in .csv"
+        raise UsageError(f"{option} {text[:80]!r}: give {form}") from None
+    return pose_of_row(place, turn)
 
 
 def size_of(text: str) -> int:

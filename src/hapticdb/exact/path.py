@@ -19,7 +19,37 @@ AT_ONCE = 64
 
 
 @dataclass(frozen=True, eq=False)
-class ToolPath:
+class SampledPath:
+    """M given samples of a motion, linear in between.
+
+    ways (M,) : path parameter at each, metres, ascending; poses (M, J) : joint values.
+    """
+
+    ways: Floats
+    poses: Floats
+
+    @property
+    def length(self) -> float:
+        """Metres at the last sample."""
+        return float(self.ways[-1])
+
+    def segments(self, ways: Floats) -> Ints:
+        """Segments (n,) of path parameters (n,), 0 .. M - 2: the last sample before each."""
+        found = np.searchsorted(self.ways, ways, side="right") - 1
+        return np.asarray(np.clip(found, 0, max(len(self.ways) - 2, 0)))
+
+    def fraction(self, way: float) -> float:
+        """Share of the path's motion before a path parameter, 0 .. 1."""
+        return min(way / self.length, 1.0) if self.length > 0.0 else 0.0
+
+    def at(self, ways: ArrayLike) -> Floats:
+        """Samples (n, J) at path parameters (n,), clamped to the ends of the path."""
+        given = np.asarray(ways, dtype=np.float64)
+        return np.stack([np.interp(given, self.ways, one) for one in self.poses.T], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class ToolPath(SampledPath):
     """M given poses and the motion between them.
 
     The tool's `center` moves on straight lines, and the tool turns about it evenly, about one axis
@@ -27,17 +57,15 @@ class ToolPath:
 
     Attributes
     ----------
-    poses : (M, 4, 4)
-        As given, `world_from_tool`.
     ways : (M,)
         Path parameter at each given pose, metres: no place of the tool moves more than the
         difference from one to the next.
+    poses : (M, 4, 4)
+        As given, `world_from_tool`.
     motion : PathMotion
         The same for kernels.
     """
 
-    poses: Floats
-    ways: Floats
     motion: PathMotion
 
     @classmethod
@@ -65,21 +93,7 @@ class ToolPath:
             rotations[again],
             turns if len(turns) else np.zeros((1, 3)),
         )
-        return cls(given, ways, PathMotion(*map(np.ascontiguousarray, (*moved, center))))
-
-    @property
-    def length(self) -> float:
-        """Metres at the last pose."""
-        return float(self.ways[-1])
-
-    def segments(self, ways: Floats) -> Ints:
-        """Segments (n,) of path parameters (n,), 0 .. M - 2: index of the last pose before each."""
-        found = np.searchsorted(self.ways, ways, side="right") - 1
-        return np.asarray(np.clip(found, 0, max(len(self.ways) - 2, 0)))
-
-    def fraction(self, way: float) -> float:
-        """Share of the path's motion before a path parameter, 0 .. 1."""
-        return min(way / self.length, 1.0) if self.length > 0.0 else 0.0
+        return cls(ways, given, PathMotion(*map(np.ascontiguousarray, (*moved, center))))
 
     def at(self, ways: ArrayLike) -> Floats:
         """Poses (n, 4, 4) at path parameters (n,), clamped to the ends of the path."""

@@ -21,19 +21,29 @@ def percent(fraction: float) -> str:
 
 def names_of(objects: Sequence[Object]) -> str:
     """Names of objects in one phrase, `MOST_NAMED` at most: ``seat, belt, door and 4 more``."""
-    names = [obj.name for obj in objects]
+    return _listed([obj.name for obj in objects])
+
+
+def _listed(names: Sequence[str]) -> str:
     more = len(names) - MOST_NAMED
     return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def verdict_line(found: Swept, shell: PointShell) -> str:
+def name_of(one: PathPlace | TouchedObject) -> str:
+    """Name of an object, after the machine's link that meets it: ``hand and panel``."""
+    return f"{one.body} and {one.object.name}" if one.body else one.object.name
+
+
+def verdict_line(found: Swept, shell: PointShell | None) -> str:
     """Write the verdict in one line.
 
-    shell : the tool; by its size it lies inside an object, or the object inside it.
+    shell : the tool, None for a machine; by its size it lies inside an object, or the object inside
+    it.
     """
     if found.verdict is PathVerdict.HITS:
         late = "the time was over: what is hit before may be missing" if found.is_stopped else ""
-        clauses = [*_enclosed_clauses(found, shell), *_hit_clauses(found), late]
+        enclosed = () if shell is None else _enclosed_clauses(found, shell)
+        clauses = [*enclosed, *_hit_clauses(found), late]
         return "; ".join(filter(None, clauses))
     if found.undecided:
         return (
@@ -50,9 +60,7 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
 
 def overlaps_text(found: Swept) -> str:
     """Write the overlaps of the part at the start, the greatest first."""
-    overlaps = [f"{one.object.name} {length_text(one.start)}" for one in found.overlapping]
-    more = len(overlaps) - MOST_NAMED
-    said = ", ".join(overlaps[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    said = _listed([f"{name_of(one)} {length_text(one.start)}" for one in found.overlapping])
     return f", but for overlaps at the start: {said}" if said else ""
 
 
@@ -66,7 +74,7 @@ def gap_text(found: Swept) -> str:
 
 def where_text(found: Swept, place: PathPlace) -> str:
     """Write a place on the path: ``31.2 % of the path (segment 4)``."""
-    segment = f" (segment {place.segment})" if len(found.path.poses) > 2 else ""
+    segment = f" (segment {place.segment})" if len(found.path.ways) > 2 else ""
     return f"{percent(place.fraction)} of the path{segment}"
 
 
@@ -79,15 +87,18 @@ def hit_text(found: Swept, place: PathPlace) -> str:
     """Write the kind and the place of a hit."""
     where, name = f"at {where_text(found, place)}", place.object.name
     depth = f": at least {length_text(place.at_least)}" if place.at_least else ""
+    link = f"{place.body} " if place.body else ""
+    if link and any(one is place.object for one in found.enclosed):
+        return f"{link}lies inside {name}, or around it"
     for one in found.touching:
-        if one.object.id != place.object.id:
+        if (one.object.id, name_of(one)) != (place.object.id, name_of(place)):
             continue
         if not one.by:
-            return f"starts inside {name}{depth}"
+            return f"{link}starts inside {name}{depth}"
         if one.until != place.fraction:
-            return f"leaves {name} and hits it again {where}"
-        return f"goes into {name} {where}{depth or ' by more than the tolerance'}"
-    return f"hits {name} {where}"
+            return f"{link}leaves {name} and hits it again {where}"
+        return f"{link}goes into {name} {where}{depth or ' by more than the tolerance'}"
+    return f"{link}hits {name} {where}"
 
 
 def is_around(obj: Object, found: Swept, shell: PointShell) -> bool:
@@ -113,7 +124,7 @@ def _hit_clauses(found: Swept) -> Iterable[str]:
     if found.hits:
         yield hit_text(found, found.hits[0])
     if len(found.hits) > 1:
-        yield f"then {names_of([place.object for place in found.hits[1:]])}"
+        yield f"then {_listed([name_of(place) for place in found.hits[1:]])}"
 
 
 def _free_clause(found: Swept) -> str:
@@ -131,7 +142,7 @@ def _free_clause(found: Swept) -> str:
 def _clear_clause(found: Swept) -> str:
     gap, place = found.gap, found.gap.place
     if place is not None:
-        nearest = f"nearest {place.object.name} at {where_text(found, place)}"
+        nearest = f"nearest {name_of(place)} at {where_text(found, place)}"
         return f"clear by {length_text(gap.at_least)}: {nearest}{error_text(gap.error)}"
     if np.isfinite(gap.at_least):
         return f"clear: nothing nearer than {length_text(gap.at_least)}"
@@ -151,4 +162,4 @@ def _touching_clauses(found: Swept) -> Iterable[str]:
 
 def _touched_text(touched: Sequence[TouchedObject]) -> str:
     last = max(one.until for one in touched)
-    return f"{names_of([one.object for one in touched])} {until_text(last)}"
+    return f"{_listed([name_of(one) for one in touched])} {until_text(last)}"

@@ -4,6 +4,7 @@ Broad phase: the objects' boxes, never too few of them. Narrow phase: their surf
 """
 
 import time
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from hapticdb.environment import Environment
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.exact.contact import Contact
 from hapticdb.exact.distance import Least, OverTimeError, Pair, box_gaps, error_of
-from hapticdb.exact.path import ToolPath
+from hapticdb.exact.path import SampledPath, ToolPath
 from hapticdb.exact.separation import CONTACT, SAME, Separation
 from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
 from hapticdb.ingest.geometry import parts_of
@@ -84,15 +85,23 @@ def sweep(
     ObjectNotFoundError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    asked = _Asked(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
+    asked = SweepRequest(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
     tool = MovingSurface(shell)
     way = ToolPath.of(poses, tool.corners, center_of(tool, about))
+    return swept_along(env, way, [Mover(tool, way)], asked, where, exclude)
+
+
+def swept_along(
+    env: Environment, way: SampledPath, movers: Sequence["Mover"], asked: "SweepRequest",
+    where: Words, exclude: Words, pairs: Callable[[], Iterable["LinkPair"]] = tuple,
+) -> Swept:  # fmt: skip
+    """Sweep rigid bodies, and pairs of them, along one path."""
     with suppress(ConnectionLostError):
-        return _Sweep(env, tool, way, asked).swept(where, exclude)
-    return _Sweep(env, tool, way, asked).swept(where, exclude)
+        return _Sweep(env, way, movers, asked).swept(where, exclude, pairs())
+    return _Sweep(env, way, movers, asked).swept(where, exclude, pairs())
 
 
-class _Asked(NamedTuple):
+class SweepRequest(NamedTuple):
     """Arguments as for `sweep`; until : end, `time.monotonic`."""
 
     contact: float
@@ -103,7 +112,7 @@ class _Asked(NamedTuple):
     limit: float = np.inf
     until: float = np.inf
 
-    def begun(self, limit: float | None, seconds: float | None) -> "_Asked":
+    def begun(self, limit: float | None, seconds: float | None) -> "SweepRequest":
         """Check numbers, and begin to count the seconds; UsageError."""
         most = np.inf if limit is None else limit
         if not (0.0 < self.contact < np.inf and most > 0.0):
@@ -116,6 +125,13 @@ class _Asked(NamedTuple):
         return self._replace(limit=most, until=until)
 
 
+def shape_of(part: Part) -> CollisionShape:
+    """Surface of a part, world frame."""
+    return CollisionShape(
+        part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord, index=part.faces
+    )
+
+
 def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
     """Centre (3,) of turns: as given, or the middle of the tool's box."""
     if about is None:
@@ -126,9 +142,45 @@ def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
     return center
 
 
+class Mover(NamedTuple):
+    """A rigid body on its own path.
+
+    body : name of a machine's link; ways (N,) : parameters of the given path at the poses of its
+    own, if they differ; frame : `world_from_frame` at a parameter of the given path, for a path in
+    the frame of another link.
+    """
+
+    tool: MovingSurface
+    way: ToolPath
+    body: str = ""
+    ways: Floats | None = None
+    frame: Callable[[float], Floats] | None = None
+
+    def own(self, given: float) -> float:
+        """Parameter of its own path, for one of the given path."""
+        return given if self.ways is None else float(np.interp(given, self.ways, self.way.ways))
+
+    def given(self, own: float) -> float:
+        """First parameter of the given path, for one of its own."""
+        if self.ways is None:
+            return own
+        n = int(np.searchsorted(self.way.ways, own))
+        is_there = n < len(self.ways) and self.way.ways[n] == own
+        return float(self.ways[n] if is_there else np.interp(own, self.way.ways, self.ways))
+
+
+class LinkPair(NamedTuple):
+    """Two links of a machine: one in the frame of the other, which stands for an object."""
+
+    mover: Mover
+    object: Object
+    shape: CollisionShape
+
+
 class _Touched(NamedTuple):
     """A contact from the start; gap : of the surfaces there, from below, metres."""
 
+    mover: Mover
     object: Object
     pair: Pair
     shape: CollisionShape
@@ -139,8 +191,10 @@ class _Touched(NamedTuple):
 class _Sweep:
     """State of one sweep."""
 
-    def __init__(self, env: Environment, tool: MovingSurface, way: ToolPath, asked: _Asked) -> None:
-        self._env, self._tool = env, tool
+    def __init__(
+        self, env: Environment, way: SampledPath, movers: Sequence[Mover], asked: SweepRequest
+    ) -> None:
+        self._env, self._movers = env, movers
         self._way, self._asked = way, asked
         self._looks = 0
         self._best = asked.limit
@@ -152,13 +206,15 @@ class _Sweep:
         self._undecided: list[Object] = []
         self._error = 0.0  # chord errors where the gap was measured
 
-    def swept(self, where: Words, exclude: Words) -> Swept:
+    def swept(self, where: Words, exclude: Words, pairs: Iterable[LinkPair]) -> Swept:
         """Sweep, in one snapshot."""
         began, is_stopped = time.monotonic(), False
         with self._env.store.snapshot():
             revision = self._env.store.revision()
             objects = self._env.felt(where, exclude)
             try:
+                for mover, obj, shape in pairs:
+                    self._look_at(mover, obj, shape, is_inside=True)
                 near = self._decide(objects)
                 self._follow()
             except OverTimeError:
@@ -182,8 +238,8 @@ class _Sweep:
 
     def _decide(self, objects: list[Object]) -> int:
         """Decide about objects, the nearest boxes first; returns their number."""
-        edges, gaps = box_gaps(self._tool, self._way, objects)
-        nearest = gaps.min(axis=1, initial=np.inf)
+        least_gaps, is_inside = self._box_gaps(objects)
+        nearest = least_gaps.min(axis=0, initial=np.inf)
         order = np.argsort(nearest, kind="stable").tolist()
         n_near = int((nearest < self._asked.limit).sum())
         parts = parts_of(self._env.store, [objects[i] for i in order])
@@ -193,11 +249,31 @@ class _Sweep:
                 self._closed = min(self._closed, least)
                 return n
             obj, part = next(parts)
-            if gaps[i, edges[:-1] <= self._end].min() < self._wanted():
-                self._look_at(obj, part, is_inside=bool(gaps[i, 0] <= 0.0))
+            shape = shape_of(part)
+            for n_mover, mover in enumerate(self._movers):
+                least = float(least_gaps[n_mover, i])
+                if least >= self._wanted():
+                    self._closed = min(self._closed, least)
+                elif self._is_near(mover, obj):
+                    self._look_at(mover, obj, shape, is_inside=bool(is_inside[n_mover, i]))
             if self._asked.progress is not None:
                 self._asked.progress(n + 1, n_near)
         return len(objects)
+
+    def _box_gaps(self, objects: list[Object]) -> tuple[Floats, NDArray[np.bool_]]:
+        """Least distances (L, O) of each mover's box, and whether it meets them at the start."""
+        found = [box_gaps(one.tool, one.way, objects)[1] for one in self._movers]
+        return (
+            np.array([gaps.min(axis=1, initial=np.inf) for gaps in found]),
+            np.array([gaps[:, 0] <= 0.0 for gaps in found]),
+        )
+
+    def _is_near(self, mover: Mover, obj: Object) -> bool:
+        """Whether the boxes come near each other before the path's end of interest."""
+        if self._end >= self._way.length:
+            return True
+        edges, gaps = box_gaps(mover.tool, mover.way, [obj])
+        return bool(gaps[0, edges[:-1] <= mover.own(self._end)].min() < self._wanted())
 
     @property
     def _end(self) -> float:
@@ -213,40 +289,46 @@ class _Sweep:
             return 2.0 * MEETING
         return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
 
-    def _look_at(self, obj: Object, part: Part, *, is_inside: bool) -> None:
-        """Decide about one object; is_inside : whether its box meets the tool's at the start.
+    def _look_at(
+        self, mover: Mover, obj: Object, shape: CollisionShape, *, is_inside: bool
+    ) -> None:
+        """Decide about one object; is_inside : whether its box meets the mover's at the start.
 
         A contact is only followed a little at first: most hits are there.
         """
-        shape = CollisionShape(
-            part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord, index=part.faces
-        )
-        error = shape.chord + self._tool.chord
-        pair = Pair(shape.tree, self._tool, self._way, self._asked.until, self._end, error)
-        contact, pose = self._asked.contact, self._way.at([0.0])[0]
+        tool, way = mover.tool, mover.way
+        error = shape.chord + tool.chord
+        pair = Pair(
+            shape.tree, tool, way, self._asked.until, mover.own(self._end), error,
+            None if mover.ways is None else obj.bounds,
+        )  # fmt: skip
+        contact, pose = self._asked.contact, way.at([0.0])[0]
         gap = pair.measure(np.zeros(1), np.array([2.0 * contact]))
         apart = float(gap.at_least[0])
         is_touched = gap.at_most[0] <= contact
         is_nested = (
-            (is_inside or is_touched)
-            and apart > SAME
-            and Separation(shape, self._tool).is_nested(pose)
+            (is_inside or is_touched) and apart > SAME and Separation(shape, tool).is_nested(pose)
         )
         if is_nested:
             (self._enclosed if apart > error else self._undecided).append(obj)
-        elif is_touched and not part.is_cloud:
-            self._touch(obj, pair, shape, apart)
+            if mover.body and apart > error:
+                at = pair.nearest_at(pose)
+                self._hits.append(self._place(mover, obj, 0.0, at.on_b[0], at.on_a[0]))
+        elif is_touched and not shape.is_cloud:
+            self._touch(mover, obj, pair, shape, apart)
             return
-        self._measure(obj, pair, shape, 0.0)
+        self._measure(mover, obj, pair, shape, 0.0)
         self._looks += pair.looks
 
-    def _touch(self, obj: Object, pair: Pair, shape: CollisionShape, gap: float) -> None:
+    def _touch(
+        self, mover: Mover, obj: Object, pair: Pair, shape: CollisionShape, gap: float
+    ) -> None:
         """Begin a contact; gap : of the surfaces at the start of the path."""
         is_fine = pair.error < self._asked.contact
         found = self._contact(pair, shape, gap, pair.error if is_fine else -pair.error)
         if not is_fine:
             self._undecided.append(obj)
-        self._contacts.append(_Touched(obj, pair, shape, gap, found))
+        self._contacts.append(_Touched(mover, obj, pair, shape, gap, found))
         if found.is_hit:
             self._note_hit(len(self._contacts) - 1)
         self._advance(len(self._contacts) - 1, FIRST_SHARE * self._way.length)
@@ -262,43 +344,45 @@ class _Sweep:
             share = min(LATER * share, 1.0)
             for n in range(len(self._contacts)):
                 self._advance(n, share * self._way.length)
-        for obj, pair, shape, _, found in self._contacts:
-            if found.is_apart and found.way < self._end:
-                self._measure(obj, pair, shape, found.way)
+        for mover, obj, pair, shape, _, found in self._contacts:
+            if found.is_apart and found.way < mover.own(self._end):
+                self._measure(mover, obj, pair, shape, found.way)
 
     def _advance(self, n: int, end: float) -> None:
         """Follow the n-th contact to a path parameter, and note a hit."""
-        found = self._contacts[n].found
+        mover, found = self._contacts[n].mover, self._contacts[n].found
         if not found.is_over:
-            found.advance(min(end, self._end))
+            found.advance(mover.own(min(end, self._end)))
             if found.is_hit:
                 self._note_hit(n)
 
     def _note_hit(self, n: int) -> None:
         """Note the hit at the end of the n-th contact, unless it is within the chord error."""
-        obj, pair, shape, gap, found = self._contacts[n]
+        mover, obj, pair, shape, gap, found = self._contacts[n]
         if found.error > 0.0:
             found = self._contact(pair, shape, gap, -found.error)
-            found.advance(self._end)
+            found.advance(mover.own(self._end))
             self._contacts[n] = self._contacts[n]._replace(found=found)
             if not found.is_hit:
                 self._undecided.append(obj)
                 return
         depth, place = found.depth()
         if not depth:
-            place = pair.nearest_at(self._way.at([found.way])[0]).on_a[0]
-        self._hits.append(self._place(obj, found.way, place, place, depth))
+            place = pair.nearest_at(pair.way.at([found.way])[0]).on_a[0]
+        self._hits.append(self._place(mover, obj, found.way, place, place, depth))
 
     def _told(self, one: _Touched) -> TouchedObject:
         found = one.found
-        is_open = not found.is_over and found.way >= self._way.length
-        until = 1.0 if is_open else self._way.fraction(found.way)
+        is_open = not found.is_over and found.way >= one.pair.way.length
+        until = 1.0 if is_open else self._way.fraction(one.mover.given(found.way))
         return TouchedObject(
             one.object, found.start, found.start_at_least, found.reach, until, found.by,
-            found.is_sliding,
+            found.is_sliding, one.mover.body,
         )  # fmt: skip
 
-    def _measure(self, obj: Object, pair: Pair, shape: CollisionShape, begin: float) -> None:
+    def _measure(
+        self, mover: Mover, obj: Object, pair: Pair, shape: CollisionShape, begin: float
+    ) -> None:
         """Find the first collision with an object from a path parameter on, or the least distance.
 
         A former contact begins near, so it has no part in the gap.
@@ -313,20 +397,27 @@ class _Sweep:
         if pair.error and least.at_most <= pair.error and not self._is_met(pair, shape, least):
             self._undecided.append(obj)
         elif least.at_most <= MEETING:
-            self._hits.append(self._place(obj, least.way, least.on_tool, least.on_object))
+            self._hits.append(self._place(mover, obj, least.way, least.on_tool, least.on_object))
         elif is_counted:
             self._best, self._error = least.at_most, pair.error
-            self._nearest = self._place(obj, least.way, least.on_tool, least.on_object)
+            self._nearest = self._place(mover, obj, least.way, least.on_tool, least.on_object)
 
     def _is_met(self, pair: Pair, shape: CollisionShape, least: Least) -> bool:
         """Whether the true surfaces collide: an overlap beyond the chord errors soon after."""
-        way = min(least.way + BEYOND * pair.error, self._way.length)
-        found = Separation(shape, self._tool, pair.check_time)
-        return found.depth(self._way.at([way])[0], pair.error)[0] > 0.0
+        way = min(least.way + BEYOND * pair.error, pair.way.length)
+        found = Separation(shape, pair.tool, pair.check_time)
+        return found.depth(pair.way.at([way])[0], pair.error)[0] > 0.0
 
     def _place(
-        self, obj: Object, way: float, on_tool: Floats, on_object: Floats, depth: float = 0.0
-    ) -> PathPlace:
-        ways = np.array([way])
-        segment, pose = int(self._way.segments(ways)[0]), self._way.at(ways)[0]
-        return PathPlace(obj, self._way.fraction(way), segment, pose, on_tool, on_object, depth)
+        self, mover: Mover, obj: Object, way: float, on_tool: Floats, on_object: Floats,
+        depth: float = 0.0,
+    ) -> PathPlace:  # fmt: skip
+        given, pose = mover.given(way), mover.way.at([way])[0]
+        segment = int(self._way.segments(np.array([given]))[0])
+        if mover.frame is not None:
+            frame = mover.frame(given)
+            pose = frame @ pose
+            on_tool, on_object = (frame[:3, :3] @ at + frame[:3, 3] for at in (on_tool, on_object))
+        return PathPlace(
+            obj, self._way.fraction(given), segment, pose, on_tool, on_object, depth, mover.body
+        )

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.exact.path import ToolPath
+from hapticdb.exact.path import SampledPath
 from hapticdb.store.base import Object
 from hapticdb.tabular.schema import plain
 from hapticdb.tabular.tables import Columns, Tabular, columns_of
@@ -17,8 +17,8 @@ from hapticdb.verdicts import PathVerdict
 Floats = NDArray[np.float64]
 
 SWEPT_KEYS = (
-    "what", "id", "name", "fraction", "segment", "on_tool", "on_object", "at_least", "until",
-    "start", "start_at_least", "reach", "by", "gap", "verdict",
+    "what", "id", "name", "body", "fraction", "segment", "on_tool", "on_object", "at_least",
+    "until", "start", "start_at_least", "reach", "by", "gap", "verdict",
 )  # fmt: skip
 """Keys of a sweep's rows: an object hit, enclosed or touched at the start, and the nearest one;
 `what` names the case, and cells without meaning in a case are empty."""
@@ -31,7 +31,7 @@ class PathPlace(NamedTuple):
     the start of its segment, 0 .. M - 2; pose (4, 4) : `world_from_tool`; on_tool, on_object (3,) :
     the nearest places of the two surfaces, world frame; in a collision, both near its place, or the
     deepest; at_least : proved penetration depth shortly after it, metres, of a contact from the
-    start; 0 without a proof.
+    start; 0 without a proof; body : link of a machine, empty for a tool.
     """
 
     object: Object
@@ -41,6 +41,7 @@ class PathPlace(NamedTuple):
     on_tool: Floats
     on_object: Floats
     at_least: float = 0.0
+    body: str = ""
 
 
 class Gap(NamedTuple):
@@ -64,7 +65,7 @@ class TouchedObject(NamedTuple):
     tolerance if enough; infinite without any; start_at_least : proved penetration depth there, or
     0; reach : greatest displacement by the motion with a free path; by : the kind of that motion;
     until : fraction of the path at the end of the contact, 1 at the end of the path; is_sliding :
-    whether the tool moves on by more than the tolerance in contact.
+    whether the tool moves on by more than the tolerance in contact; body : as of a place.
     """
 
     object: Object
@@ -74,6 +75,7 @@ class TouchedObject(NamedTuple):
     until: float
     by: str
     is_sliding: bool
+    body: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +84,10 @@ class Swept(Tabular):
 
     Attributes
     ----------
-    path : ToolPath
-        The poses given, and the motion between them: `path.at(fractions * path.length)` gives
-        poses, and no place of the tool moves more than `path.length` metres.
+    path : SampledPath
+        The poses given (of a machine: joint values), and the motion between them:
+        `path.at(fractions * path.length)` gives poses, and no place of the tool moves more than
+        `path.length` metres.
     gap : Gap
         Of all objects that are not touched where the path starts; 0 if anything is hit.
     hits : tuple of PathPlace
@@ -109,9 +112,11 @@ class Swept(Tabular):
         Seconds.
     is_stopped : bool
         Whether the time ended the sweep before all was decided.
+    notes : tuple of str
+        Of a machine: limits exceeded, pairs of links left out.
     """
 
-    path: ToolPath
+    path: SampledPath
     gap: Gap
     hits: tuple[PathPlace, ...]
     touching: tuple[TouchedObject, ...]
@@ -124,6 +129,7 @@ class Swept(Tabular):
     revision: int
     elapsed: float
     is_stopped: bool = False
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         met = [obj.name for obj in (*(place.object for place in self.hits), *self.enclosed)]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.closing import Closes
-from hapticdb.exact.path import ToolPath
+from hapticdb.exact.path import SampledPath
 from hapticdb.extraction.problem import Problem, guarded_shell
 from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
@@ -41,7 +41,7 @@ class Room:
         self.n_poses = 0
         self._frames, self._problem = frames, problem
 
-    def ways(self, path: ToolPath) -> Floats:
+    def ways(self, path: SampledPath) -> Floats:
         """Path parameters (n,), at most `STEP` voxels apart."""
         steps = path.length / (STEP * self._problem.voxel_size)
         return np.linspace(0.0, path.length, 1 + max(int(np.ceil(steps)), 1))

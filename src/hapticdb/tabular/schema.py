@@ -33,7 +33,7 @@ FIELDS = {
     "Swept": (
         "verdict gap=gap.at_least gap_at_most=gap.at_most chord_error=gap.error nearest=gap.place "
         "comes_out hits touching enclosed undecided contact overlap objects looks revision elapsed "
-        "is_stopped length=path.length"
+        "is_stopped length=path.length notes"
     ),
     "WayOut": "how poses length gap proof=swept",
 }

@@ -11,15 +11,12 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.choosing import FilterOptions, ids_of
 from hapticdb.cli.emit import Output
-from hapticdb.cli.values import MIB, numbers_of, point_of, refuse
+from hapticdb.cli.values import MIB, pose_of, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import plain
 from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from hapticdb.environment import Environment
     from hapticdb.extraction.disassembly import Disassembly
     from hapticdb.extraction.result import Extraction
@@ -126,7 +123,7 @@ def extract(
     if to:
         refuse("with --to", order, "disassemble")
         refuse("with --to", search, "out screw")
-    goal = _goal(to) if to else None
+    goal = pose_of(to, "--to") if to else None
     options: dict[str, Any] = vars(search) | {"budget_bytes": budget}
     options |= {"depth": order.depth} if order.disassemble else {"to": goal}
     options = {name: value for name, value in options.items() if value is not None}
@@ -150,27 +147,6 @@ def extract(
 
 
 extract.__doc__ = HELP
-
-
-def _goal(to: str) -> "NDArray[np.float64]":
-    """Pose (4, 4) of --to, metres: given as numbers, millimetres, or as a file, metres."""
-    import numpy as np
-
-    from hapticdb.poses import pose_of_row, read_poses
-
-    if to.lower().endswith(".csv"):
-        poses = read_poses(to)
-        if len(poses) != 1:
-            raise UsageError(f"--to {to}: it has {len(poses)} poses, give a file of one")
-        return np.asarray(poses[0])
-    words = to.replace(",", " ").split()
-    try:
-        place = point_of(" ".join(words[:3]), "mm")
-        turn = numbers_of(" ".join(words[3:]), 4, "--to", "qw,qx,qy,qz")
-    except UsageError:
-        form = "x,y,z,qw,qx,qy,qz, or a file whose name ends in .csv"
-        raise UsageError(f"--to {to[:80]!r}: give {form}") from None
-    return pose_of_row(place, turn)
 
 
 def _report(

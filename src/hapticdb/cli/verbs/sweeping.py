@@ -1,7 +1,7 @@
 """The verb sweep."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, NamedTuple
@@ -14,7 +14,7 @@ from hapticdb.cli.emit import TableOutput, open_csv
 from hapticdb.cli.options import UnitName
 from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
 from hapticdb.cli.tools import tool_of, warn_of_size
-from hapticdb.cli.values import Point
+from hapticdb.cli.values import Point, pose_of, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import plain
 from hapticdb.units import length_text
@@ -49,6 +49,9 @@ The path is free of what is touched at the start if the tool, moved aside or def
 --contact, follows it and meets nothing; once they are farther apart than that, to meet it again is
 a hit. A foreign tool has no seat: if that does not free it at the first pose, it starts inside.
 
+With --machine and --joints, the links of a URDF or MJCF file move on their joints, linearly between
+two rows, and are tested against objects and one another.
+
 --batch reads a CSV file with the columns part or tool, and path; and if wanted where, exclude and
 contact (mm, or such as 0.2in). Several words in a cell stand with ; between.
 
@@ -71,6 +74,16 @@ class SweepOptions:
     until_hit: bool = False
 
 
+@dataclass(frozen=True)
+class MachineOptions:
+    """Options of a machine: its file and those beside it, and where it stands."""
+
+    machine: str | None = None
+    joints: str | None = None
+    srdf: str | None = None
+    at: str | None = None
+
+
 class _Job(NamedTuple):
     """Sweep with resolved objects and its poses; parts : ids of the moving objects."""
 
@@ -84,7 +97,7 @@ class _Told(NamedTuple):
     """Result of a sweep with its tool; seconds : of the sweep and of making the tool."""
 
     job: _Job
-    shell: "PointShell"
+    shell: "PointShell | None"
     found: "Swept"
     seconds: float
 
@@ -96,6 +109,7 @@ def sweep(
     part: list[str] | None = None,
     path: str | None = None,
     batch: str | None = None,
+    machine: MachineOptions,
     felt: FilterOptions,
     contact: float = 5e-5,
     motion: SweepOptions,
@@ -107,11 +121,17 @@ def sweep(
 
     where, exclude = felt.where or [], felt.exclude or []
     one = Asked(tool, part or [], path or "", where, exclude, contact, "")
-    _check(one, motion.tool_unit, batch, output.csv)
+    if machine != MachineOptions():
+        one = _checked_machine(one, machine, motion, batch)
+    else:
+        _check(one, motion.tool_unit, batch, output.csv)
     asked = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(output.csv, SWEPT_KEYS) as table, hapticdb.open(url, read_only=True) as env:
-        jobs = [_job(env, each, motion.path_unit) for each in asked]
-        told = _all_swept(env, jobs, motion, output)
+        if machine.machine is None:
+            jobs = [_job(env, each, motion.path_unit) for each in asked]
+            told = _all_told((_swept(env, job, motion) for job in jobs), output)
+        else:
+            told = _all_told([_machine_swept(env, one, machine, motion)], output)
         if table:
             table.add(*told[0].found.records())
         if batch is None and output.has_words:
@@ -143,6 +163,20 @@ def _check(one: Asked, tool_unit: str | None, batch: str | None, csv: str | None
         )
 
 
+def _checked_machine(
+    one: Asked, machine: MachineOptions, motion: SweepOptions, batch: str | None
+) -> Asked:
+    """Request for a sweep of a machine; UsageError for contradictory options."""
+    if machine.machine is None or machine.joints is None:
+        raise UsageError("give --machine, a URDF or MJCF file, and --joints, its path")
+    given = {"--tool": one.tool, "--part": one.part, "--path": one.path, "--batch": batch}
+    for name, value in given.items():
+        if value:
+            raise UsageError(f"--machine and {name}: give only one of them")
+    refuse("with --machine", motion, "about tool_unit path_unit")
+    return one._replace(tool=machine.machine, path=machine.joints)
+
+
 def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
     from hapticdb.poses import read_poses
 
@@ -152,21 +186,44 @@ def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
         return _Job(asked, poses, parts, FilterOptions(asked.where, asked.exclude).felt(env, parts))
 
 
-def _all_swept(
-    env: "Environment", jobs: Sequence[_Job], motion: SweepOptions, output: TableOutput
-) -> list[_Told]:
+def _all_told(sweeps: Iterable[_Told], output: TableOutput) -> list[_Told]:
     """Run sweeps; JSON of each is printed at once."""
     from hapticdb.exact.report import verdict_line
 
     told = []
-    for job in jobs:
-        told.append(one := _swept(env, job, motion))
+    for one in sweeps:
+        told.append(one)
         if output.json:
-            asked, line = job.asked, verdict_line(one.found, one.shell)
+            asked, line = one.job.asked, verdict_line(one.found, one.shell)
             about = {"moved": asked.name, "path": asked.path, "line": line}
-            left = {"parts": job.parts, "excluded": job.felt.left_out}
+            left = {"parts": one.job.parts, "excluded": one.job.felt.left_out}
             render.say_json(about | plain(one.found) | left)
     return told
+
+
+def _machine_swept(
+    env: "Environment", asked: Asked, given: MachineOptions, motion: SweepOptions
+) -> _Told:
+    """Read a machine, and sweep it along its joint path."""
+    from hapticdb.machines.joint_path import read_joints
+    from hapticdb.machines.reader import read_machine
+    from hapticdb.machines.sweep import sweep_machine
+
+    began = perf_counter()
+    felt = FilterOptions(asked.where, asked.exclude).felt(env)
+    with render.bar("reading the machine", "files"):
+        machine = read_machine(given.machine or "", given.srdf)
+    q = read_joints(asked.path, machine)
+    with render.bar("sweeping", "objects") as progress:
+        found = sweep_machine(
+            env, machine, q, at=None if given.at is None else pose_of(given.at, "--at"),
+            where=felt.where, exclude=felt.exclude, contact=asked.contact,
+            overlap=motion.overlap, seconds=motion.seconds, until_hit=motion.until_hit,
+            progress=progress,
+        )  # fmt: skip
+    for note in found.notes:
+        render.note(note)
+    return _Told(_Job(asked, q, [], felt), None, found, perf_counter() - began)
 
 
 def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Told:
@@ -212,18 +269,18 @@ def _show_batch(told: Sequence[_Told]) -> None:
 
 def _show(told: _Told) -> None:
     """Print the verdict, a table of hits and contacts, and the figures behind the verdict."""
-    from hapticdb.exact.report import gap_text, percent, until_text, verdict_line
+    from hapticdb.exact.report import gap_text, name_of, percent, until_text, verdict_line
 
     found = told.found
     render.say(verdict_line(found, told.shell), found.verdict.exit_status)
     rows = [
-        (place.object.id, place.object.name, "hit", f"at {percent(place.fraction)}", "", "")
+        (place.object.id, name_of(place), "hit", f"at {percent(place.fraction)}", "", "")
         for place in found.hits
     ]
     rows += [
         (
             one.object.id,
-            one.object.name,
+            name_of(one),
             "touched",
             until_text(one.until).removesuffix(" of the path"),
             length_text(one.start_at_least) if one.start_at_least else "",
@@ -231,9 +288,10 @@ def _show(told: _Told) -> None:
         )
         for one in found.touching
     ]
-    columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
-    render.table(columns, rows, len(rows))
-    poses = render.counted(len(found.path.poses), "pose")
+    if rows:
+        columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
+        render.table(columns, rows, len(rows))
+    poses = render.counted(len(found.path.ways), "pose" if told.shell else "row")
     facts = [("path", f"{poses}, {length_text(found.path.length)}")]
     if found.is_free:
         facts.append(("gap", _gap_range(found, gap_text(found))))

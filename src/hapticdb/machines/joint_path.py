@@ -1,0 +1,148 @@
+"""Joint paths: CSV files, and the path of each link as poses so near that rigid motion bounds it.
+
+Between two rows the joints move linearly, so a link moves on no line and about no axis. Its path is
+cut so that the motion of a sweep, straight with an even turn, deviates from it by `DEVIATION` at
+most: a place between two poses is h^2 / 8 of its greatest second derivative from the straight line,
+on either motion. A sweep takes that off its gaps; a collision begins at five times as much.
+"""
+
+import csv
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import FileError, UsageError
+from hapticdb.exact.path import SampledPath, ToolPath
+from hapticdb.exact.sweep import Mover
+from hapticdb.machines.machine import HINGE, Machine, motion_bounds
+from hapticdb.poses import as_floats
+from hapticdb.units import UNITS
+
+Floats = NDArray[np.float64]
+
+DEVIATION = 2e-6
+"""Greatest deviation of a link from its motion, metres. Larger: fewer poses, and wider bounds."""
+MOST_TURN = 0.5
+"""Greatest turn of a link between two poses, radians."""
+MOST_POSES = 1_000_000
+"""Poses of a link's path. Larger: more memory, 0.1 GiB each million."""
+_NAME = re.compile(r"(.*?)\s*(?:\[\s*(\S+)\s*\])?")
+_DEGREE = np.pi / 180.0
+
+
+def read_joints(path: str, machine: Machine) -> Floats:
+    """Values (rows, driven) of a CSV file with a column a joint; joints without one stay at 0.
+
+    Radians and metres, or a unit in the header: ``elbow [deg]``, ``lift [mm]``.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise FileError(f"cannot read {path}: {why}") from error
+    try:
+        lines = [line for line in csv.reader(text.splitlines(), strict=True) if any(line)]
+    except csv.Error as error:
+        raise FileError(f"{path}: {error}") from error
+    if len(lines) < 2:
+        raise FileError(
+            f"{path}: give a header with the names of joints, and a row for each sample"
+        )
+    columns = [_column(path, head.strip(), machine) for head in lines[0]]
+    if len({n for n, _ in columns}) < len(columns):
+        raise FileError(f"{path}: its header names a joint twice")
+    q = np.zeros((len(lines) - 1, len(machine.driven)))
+    for row, line in enumerate(lines[1:]):
+        if len(line) != len(columns):
+            raise FileError(f"{path}, row {row}: {len(line)} values for {len(columns)} joints")
+        for (n, factor), cell in zip(columns, line, strict=True):
+            try:
+                q[row, n] = factor * float(cell)
+            except ValueError:
+                raise FileError(f"{path}, row {row}: {cell[:40]!r} is no number") from None
+    return q
+
+
+def _column(path: str, head: str, machine: Machine) -> tuple[int, float]:
+    """Column of `Machine.driven`, and factor, of a header."""
+    known = ", ".join(machine.driven)
+    name, unit = head, None
+    if head not in machine.driven and (match := _NAME.fullmatch(head)):
+        name, unit = match[1], match[2]
+    if name not in machine.driven:
+        follows = next((one.driver for one in machine.joints if name in one.name == name), "")
+        why = f"follows {follows!r}, so leave it out" if follows else f"is none of its: {known}"
+        raise FileError(f"{path}: joint {name[:60]!r} {why}")
+    joint = next(one for one in machine.joints if one.name == name)
+    units = {"rad": 1.0, "deg": _DEGREE} if joint.kind == HINGE else UNITS
+    if unit is not None and unit not in units:
+        raise FileError(f"{path}: {head!r}: give {name} in {', '.join(units)}")
+    return machine.driven.index(name), units[unit] if unit else 1.0
+
+
+def checked_values(machine: Machine, q: ArrayLike) -> Floats:
+    """Values (rows, joints) of all joints, two rows at least, for those of the driven ones."""
+    given = as_floats(q, "a joint path")
+    wanted = len(machine.driven)
+    if given.ndim != 2 or given.shape[1] != wanted or not len(given):
+        raise UsageError(
+            f"a joint path of shape {given.shape}: give (rows, {wanted}), a column for each of "
+            f"{', '.join(machine.driven) or 'no joint'}"
+        )
+    bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
+    if len(bad):
+        raise UsageError(f"row {bad[0]} of the joint path has a value that is not finite")
+    return machine.values(given if len(given) > 1 else given[[0, 0]])
+
+
+def beyond_limits(machine: Machine, values: Floats) -> Iterable[str]:
+    """A note for each joint whose values leave its limits."""
+    for joint, own in zip(machine.joints, values.T, strict=True):
+        over = np.maximum(own - joint.high, joint.low - own)
+        row = int(np.argmax(over))
+        if over[row] > 1e-9:
+            unit = "rad" if joint.kind == HINGE else "m"
+            yield (
+                f"joint {joint.name} is at {own[row]:.6g} {unit} in row {row}, outside its limits "
+                f"{joint.low:.6g} to {joint.high:.6g}"
+            )
+
+
+def joint_path(machine: Machine, values: Floats, pairs: Iterable[tuple[int, int]]) -> SampledPath:
+    """Path over rows, its parameter the greatest motion of any link in the frame of another."""
+    speeds = [motion_bounds(machine, values, *pair).speed for pair in pairs]
+    ways = np.concatenate([[0.0], np.cumsum(np.max(speeds, axis=0))])
+    if not np.isfinite(ways[-1]):
+        raise UsageError("the joint path is longer than numbers go: check its units")
+    return SampledPath(ways, values)
+
+
+def mover_of(
+    machine: Machine, path: SampledPath, first: int, last: int,
+    frame: Callable[[float], Floats] | None, base: Floats,
+) -> Mover:  # fmt: skip
+    """A link on its path in the frame of another one; base (4, 4) : `world_from_base`."""
+    values, surface = path.poses, machine.surfaces[last]
+    _, bend, turn = motion_bounds(machine, values, first, last)
+    counts = np.maximum(np.sqrt(bend / (8.0 * DEVIATION)), turn / MOST_TURN)
+    counts = np.maximum(np.ceil(counts), 1.0)
+    if counts.sum() > MOST_POSES:
+        raise UsageError(
+            f"link {machine.names[last]} turns too much for one sweep: divide the joint path into "
+            f"{int(counts.sum() // MOST_POSES) + 1}"
+        )
+    rows = np.arange(len(counts))
+    knots = np.concatenate(
+        [row + np.arange(n) / n for row, n in zip(rows, counts.astype(int), strict=True)]
+        + [[len(rows)]]
+    )
+    own = np.stack([np.interp(knots, np.arange(len(values)), one) for one in values.T], axis=1)
+    before = base if frame is None else np.linalg.inv(machine.placed(own, first))
+    poses = before @ machine.placed(own, last)
+    poses[:, 3] = 0.0, 0.0, 0.0, 1.0
+    way = ToolPath.of(poses, surface.corners, surface.corners.mean(axis=0))
+    ways = np.interp(knots, np.arange(len(values)), path.ways)
+    return Mover(surface, way, machine.names[last], ways, frame)

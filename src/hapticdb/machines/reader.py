@@ -1,0 +1,60 @@
+"""Machine files: URDF, with the pairs of an SRDF, or MJCF."""
+
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from hapticdb.errors import FileError
+from hapticdb.machines.machine import Machine
+from hapticdb.machines.urdf import machine_of_urdf
+from hapticdb.mesh.text import xml_of
+
+
+def read_machine(path: str | PathLike[str], srdf: str | PathLike[str] | None = None) -> Machine:
+    """Machine of a URDF file, or of an MJCF file (extra `machines`).
+
+    srdf : file with the untested pairs of links (`disable_collisions`).
+
+    Raises
+    ------
+    FileError
+        If a file is missing or damaged, a mesh is not in its folder or package, a joint has an
+        unsupported kind, or the joints form no tree.
+    MissingExtraError
+        If MJCF needs `mujoco`.
+    """
+    root = xml_root(Path(path))
+    if root.tag == "robot":
+        machine = machine_of_urdf(Path(path), root)
+    elif root.tag == "mujoco":
+        from hapticdb.machines.mjcf import machine_of_mjcf  # noqa: PLC0415 - needs an extra
+
+        machine = machine_of_mjcf(Path(path))
+    else:
+        raise FileError(f"{path}: its root is <{root.tag[:40]}>: give a URDF or MJCF file")
+    if not machine.surfaces:
+        raise FileError(f"{path}: none of its links has a surface")
+    return machine if srdf is None else replace(machine, left_out=_pairs_of(Path(srdf), machine))
+
+
+def xml_root(path: Path) -> ET.Element:
+    """Root of an XML file; FileError."""
+    try:
+        return ET.fromstring(xml_of(path.read_bytes()))  # noqa: S314 - expat limits entities
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror}") from error
+    except (ET.ParseError, ValueError) as error:
+        raise FileError(f"{path} is no XML: {error}") from error
+
+
+def _pairs_of(path: Path, machine: Machine) -> frozenset[frozenset[str]]:
+    """Pairs of links of an SRDF file; FileError if none is of the machine."""
+    found = {
+        frozenset((one.get("link1", ""), one.get("link2", "")))
+        for one in xml_root(path).iter("disable_collisions")
+    }
+    known = frozenset(pair for pair in found if pair <= set(machine.names))
+    if not known:
+        raise FileError(f"{path}: no disable_collisions of links of {machine.file}")
+    return known

@@ -1,0 +1,255 @@
+"""Sweeps of machines against closed forms and dense samples."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, Machine, read_machine, sweep_machine
+from hapticdb.errors import UsageError
+from hapticdb.exact.swept import Swept
+from hapticdb.machines.joint_path import checked_values
+from hapticdb.machines.machine import motion_bounds
+from hapticdb.verdicts import PathVerdict
+
+Floats = NDArray[np.float64]
+
+PARTS = {
+    "wall": ((0.1, 4.0, 4.0), (2.05, 0.0, 0.0)),
+    "post": ((0.02, 0.02, 0.5), (-0.8, 0.0, 0.0)),
+    "tank": ((8.0, 8.0, 8.0), (0.0, 20.0, 0.0)),
+}
+"""Boxes: edges and middles, metres. The wall's side is at x 2."""
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    folder, scene = tmp_path_factory.mktemp("machines"), trimesh.Scene()
+    for name, (edges, middle) in PARTS.items():
+        made = trimesh.creation.box(edges)
+        made.apply_translation(middle)
+        scene.add_geometry(made, node_name=name, geom_name=name)
+    (folder / "parts.glb").write_bytes(scene.export(file_type="glb"))
+    options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=5), distances=False)
+    hapticdb.import_files(folder / "parts.db", [folder / "parts.glb"], options)
+    with hapticdb.open(folder / "parts.db") as made_env:
+        yield made_env
+
+
+def link(name: str, geometry: str = "", at: str = "0 0 0") -> str:
+    solid = f'<collision><origin xyz="{at}"/><geometry>{geometry}</geometry></collision>'
+    return f'<link name="{name}">{solid if geometry else ""}</link>'
+
+
+def joint(name: str, ends: str, kind: str, axis: str, at: str = "0 0 0", more: str = "") -> str:
+    parent, child = ends.split()
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{at}"/><axis xyz="{axis}"/>{more}</joint>'
+    )
+
+
+def box(size: str) -> str:
+    return f'<box size="{size}"/>'
+
+
+def machine_of(folder: Path, *texts: str) -> Machine:
+    file = folder / "machine.urdf"
+    file.write_text(f'<robot name="m">{"".join(texts)}</robot>')
+    return read_machine(file)
+
+
+EXCAVATOR = (
+    link("base"), link("boom"), link("stick", '<sphere radius="0.05"/>', "0.7 0 0"),
+    joint("shoulder", "base boom", "continuous", "0 -1 0"),
+    joint("elbow", "boom stick", "continuous", "0 -1 0", "1 0 0"),
+)  # fmt: skip
+ARM = (
+    link("base"), link("arm", box("1 0.002 0.002"), "0.5 0 0"),
+    joint("turn", "base arm", "continuous", "0 0 1"),
+)  # fmt: skip
+
+
+def test_an_excavators_gap_is_that_of_its_closed_form(env: Environment, tmp_path: Path) -> None:
+    machine = machine_of(tmp_path, *EXCAVATOR)
+    q = np.array([[1.5, 1.0], [-0.2, -1.1], [0.4, 0.9]])
+    found = sweep_machine(env, machine, q, where=["wall"])
+    shares = np.linspace(0.0, 2.0, 200_001)
+    a, b = (np.interp(shares, np.arange(3), column) for column in q.T)
+    gap = 2.0 - 0.05 - (np.cos(a) + 0.7 * np.cos(a + b)).max()
+    assert found.verdict is PathVerdict.CLEAR
+    assert found.gap.at_least <= gap <= found.gap.at_most
+    assert found.gap.at_most - found.gap.at_least < 0.01 * gap + 1e-4
+    place = found.gap.place
+    assert place is not None
+    assert (place.body, place.object.name) == ("stick", "wall")
+    assert place.on_object[0] == pytest.approx(2.0)
+    nearest = found.path.at([place.fraction * found.path.length])[0]
+    reach = np.cos(nearest[0]) + 0.7 * np.cos(nearest.sum())
+    assert reach == pytest.approx(1.95 - gap, abs=0.01 * gap + 1e-4)
+
+
+def test_a_gantry_is_clear_by_its_closed_form_and_hits_where_it_must(
+    env: Environment, tmp_path: Path
+) -> None:
+    cube = box("0.2 0.2 0.2")
+    machine = machine_of(
+        tmp_path, link("base"), link("bridge"), link("hook", cube),
+        joint("x", "base bridge", "prismatic", "1 0 0"),
+        joint("z", "bridge hook", "prismatic", "0 0 1"),
+    )  # fmt: skip
+    free = sweep_machine(env, machine, [[0.0, 1.0], [1.6, 0.0], [1.0, 0.0]], where=["wall"])
+    assert free.gap.at_least <= 0.3 <= free.gap.at_most
+    hit = sweep_machine(env, machine, [[1.0, 0.0], [3.0, 0.0]], where=["wall"])
+    assert hit.verdict is PathVerdict.HITS
+    assert hit.hits[0].fraction == pytest.approx(0.45, abs=1e-4)
+
+
+@pytest.mark.parametrize("degrees", [350.0, 10.0 * 360.0 + 90.0])
+def test_a_thin_arm_meets_a_post_far_beyond_half_a_turn(
+    env: Environment, tmp_path: Path, degrees: float
+) -> None:
+    machine = machine_of(tmp_path, *ARM)
+    begin = np.radians(200.0)
+    found = sweep_machine(env, machine, [[begin], [begin + np.radians(degrees)]], where=["post"])
+    assert [place.object.name for place in found.hits] == ["post"]
+    met = 2.0 * np.pi - np.arcsin(0.011 / 0.79) + np.pi - begin
+    assert found.hits[0].fraction == pytest.approx(met / np.radians(degrees), abs=1e-4)
+
+
+def test_a_gripper_closes_on_itself_by_a_joint_that_follows(
+    env: Environment, tmp_path: Path
+) -> None:
+    finger = box("0.02 0.02 0.1")
+    machine = machine_of(
+        tmp_path, link("palm"), link("left", finger), link("right", finger),
+        joint("close", "palm left", "prismatic", "0 1 0", "0 -0.1 0"),
+        joint("other", "palm right", "prismatic", "0 -1 0", "0 0.1 0",
+              '<mimic joint="close" multiplier="0.5"/>'),
+    )  # fmt: skip
+    assert machine.driven == ("close",)
+    free = sweep_machine(env, machine, [[0.0], [0.1], [0.0]], where=["wall"])
+    assert free.gap.at_least <= 0.2 - 0.02 - 0.15 <= free.gap.at_most
+    hit = sweep_machine(env, machine, [[0.0], [0.15]])
+    assert [(place.body, place.object.name) for place in hit.hits] == [("right", "left")]
+    assert hit.hits[0].fraction == pytest.approx(0.12 / 0.15, abs=1e-4)
+    assert hit.hits[0].on_tool[1] == pytest.approx(-0.1 + 0.12 + 0.01, abs=1e-4)
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_a_machine_at_rest_has_the_gap_of_its_pose(
+    env: Environment, tmp_path: Path, rows: int
+) -> None:
+    found = sweep_machine(env, machine_of(tmp_path, *ARM), np.zeros((rows, 1)), where=["wall"])
+    assert (found.verdict, found.path.length) == (PathVerdict.CLEAR, 0.0)
+    assert found.gap.at_least <= 1.0 <= found.gap.at_most
+
+
+def test_a_link_inside_a_closed_body_is_a_hit(env: Environment, tmp_path: Path) -> None:
+    base = np.eye(4)
+    base[:3, 3] = 0.0, 20.0, 0.0
+    found = sweep_machine(env, machine_of(tmp_path, *ARM), [[0.0], [3.0]], at=base)
+    assert found.verdict is PathVerdict.HITS
+    assert [obj.name for obj in found.enclosed] == ["tank"]
+    assert found.hits[0].body == "arm"
+
+
+@pytest.mark.parametrize("overlap", [0.0, 1e-3])
+def test_a_base_on_its_floor_touches_and_a_sunk_one_overlaps(
+    env: Environment, tmp_path: Path, overlap: float
+) -> None:
+    machine = machine_of(
+        tmp_path, link("foot", box("0.4 0.2 0.2")), link("arm", box("0.2 0.02 0.02"), "0.3 0 0"),
+        joint("turn", "foot arm", "revolute", "1 0 0"),
+    )  # fmt: skip
+    base = np.eye(4)
+    base[0, 3] = 2.3 - overlap  # its left face on the wall's right one
+    found = sweep_machine(env, machine, [[0.0], [1.0]], at=base, where=["wall"])
+    wanted = PathVerdict.OVERLAPS if overlap else PathVerdict.CLEAR
+    assert (found.verdict, found.touching[0].body) == (wanted, "foot")
+    assert found.touching[0].until == 1.0
+    assert any("foot and arm" in note for note in found.notes)
+
+
+def test_a_joint_beyond_its_limits_is_told(env: Environment, tmp_path: Path) -> None:
+    limited = ARM[2].replace("continuous", "revolute").replace("<axis", '<limit upper="1"/><axis')
+    found = sweep_machine(env, machine_of(tmp_path, *ARM[:2], limited), [[0.0], [1.2]])
+    assert [note for note in found.notes if "turn is at 1.2 rad in row 1" in note]
+
+
+@pytest.mark.parametrize(
+    ("q", "told"), [([[np.nan]], "row 0"), ([[1.0, 2.0]], "turn"), (np.zeros((0, 1)), "rows")]
+)
+def test_values_that_are_none_are_refused(
+    env: Environment,
+    tmp_path: Path,
+    q: Any,  # noqa: ANN401
+    told: str,
+) -> None:
+    with pytest.raises(UsageError, match=told):
+        sweep_machine(env, machine_of(tmp_path, *ARM), q)
+
+
+def random_machine(folder: Path, rng: np.random.Generator) -> Machine:
+    """Two arms on a sliding base, of boxes and joints at random."""
+    texts, above = [link("base")], "base"
+    kinds = ["prismatic", "revolute", "revolute", "revolute", "prismatic", "revolute"]
+    for n, kind in enumerate(kinds):
+        axis = " ".join(f"{x:.6f}" for x in rng.normal(size=3))
+        at = " ".join(f"{x:.6f}" for x in rng.normal(size=3) * 0.3)
+        texts += [link(f"link{n}", box("0.15 0.1 0.05"), at)]
+        texts += [joint(f"joint{n}", f"{above} link{n}", kind, axis, at)]
+        above = "link0" if n == 3 else f"link{n}"
+    return machine_of(folder, *texts)
+
+
+def least_of(machine: Machine, found: Swept, n: int) -> float:
+    """Least distance of the links that are tested, at n samples of the path."""
+    values = found.path.at(np.linspace(0.0, found.path.length, n))
+    least = np.inf
+    told = " ".join(found.notes)
+    for a in machine.surfaces:
+        for b in machine.surfaces:
+            if a < b and f"{machine.names[a]} and {machine.names[b]}" not in told:
+                poses = np.linalg.inv(machine.placed(values, a)) @ machine.placed(values, b)
+                tree = machine.surfaces[a].tree
+                near = machine.surfaces[b].nearest(tree, poses, np.full(n, np.inf))
+                least = min(least, float(near.at_most.min()))
+    return least
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_random_machines_are_never_clear_where_a_sample_collides(
+    env: Environment, tmp_path: Path, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    machine = random_machine(tmp_path, rng)
+    q = rng.normal(size=(3, len(machine.driven))) * 0.4
+    found = sweep_machine(env, machine, q, where=["post"], exclude=[])
+    least = least_of(machine, found, 2000)
+    assert found.gap.at_least <= least + 1e-9
+    assert (found.verdict is PathVerdict.HITS) or least > 0.0
+
+
+def test_bounds_of_the_motion_hold_for_random_machines(tmp_path: Path) -> None:
+    """Speed and second derivative of the box's corners, by differences, in each other's frame."""
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        machine = random_machine(tmp_path, rng)
+        values = checked_values(machine, rng.normal(size=(2, len(machine.driven))))
+        shares = np.linspace(0.0, 1.0, 401)[:, None]
+        dense = values[0] + shares * (values[1] - values[0])
+        for a, b in [(0, 4), (3, 5), (4, 6), (6, 2)]:
+            poses = np.linalg.inv(machine.placed(dense, a)) @ machine.placed(dense, b)
+            corners = machine.surfaces[b].corners @ np.swapaxes(poses[:, :3, :3], 1, 2)
+            corners += poses[:, None, :3, 3]
+            speed = 400.0 * np.linalg.norm(np.diff(corners, axis=0), axis=2).max()
+            bend = 400.0**2 * np.linalg.norm(np.diff(corners, n=2, axis=0), axis=2).max()
+            bounds = motion_bounds(machine, values, a, b)
+            assert speed <= bounds.speed[0] * (1.0 + 1e-9)
+            assert bend <= bounds.bend[0] * (1.0 + 1e-6)

@@ -127,6 +127,8 @@ def test_depth_of_boxes_does_not_depend_on_the_mesh(
         assert found.kind == "overlapping"
         assert depth - EXACT <= found.at_least <= depth + 1e-6
         assert found.at_most >= found.at_least
+        deep = [5.0 - np.abs(found.on_a / MM - middle).max() for middle in ((0, 0, 0), at)]
+        assert max(deep) >= depth - EXACT  # at the place that is told
 
 
 @pytest.mark.parametrize("times", [0, 1, 3])

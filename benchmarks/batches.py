@@ -28,7 +28,7 @@ import page_tables
 import records
 from batch_peers import PEERS, Open3DBatch, PeerMissingError
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
-from hapticdb.batches.feeler import Feeler
+from hapticdb.batches.batch_tool import BatchTool
 from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
@@ -164,15 +164,15 @@ def measure_tool(
             peer.close = 0.5 * size
     cells: list[dict[str, Any]] = []
     with (
-        env.feeler(tool.shell, law="plane") as all_of,
-        env.feeler(tool.shell, law="plane", jobs=1) as one,
+        env.batch_tool(tool.shell, law="plane") as all_of,
+        env.batch_tool(tool.shell, law="plane", jobs=1) as one,
     ):
 
-        def felt(feeler: Feeler) -> Side:
-            return lambda poses: feeler.touch(poses).hits > 0
+        def felt(batch_tool: BatchTool) -> Side:
+            return lambda poses: batch_tool.touch(poses).hits > 0
 
-        def far(feeler: Feeler) -> Side:
-            return lambda poses: feeler.clearance(poses, reach).distances
+        def far(batch_tool: BatchTool) -> Side:
+            return lambda poses: batch_tool.clearance(poses, reach).distances
 
         touch: dict[str, Side] = {
             OWN: all_of.collides, OWN_ONE: one.collides, FORCE: felt(all_of), FORCE_ONE: felt(one)

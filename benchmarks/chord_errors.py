@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticdb.kernels.triangles.nearest import nearest
+from hapticdb.kernels.triangles.surface_distance import nearest
 from hapticdb.mesh import MeshFile, read_file
-from hapticdb.pointshell.shape import tree_of
+from hapticdb.pointshell.shape import bvh_of
 
 MILLIMETRES = (0.1, 0.05, 0.02, 0.01, 0.005)
 
@@ -37,8 +37,8 @@ def sampled(file: MeshFile, finer: MeshFile) -> float:
             points = other.world_points()
             poses = np.tile(np.eye(4), (len(points), 1, 1))  # of a single point
             poses[:, :3, 3] = points
-            tree, far = tree_of(part.triangles()), np.full(len(points), np.inf)
-            found = nearest(tree, tree_of(np.zeros((1, 3, 3))), poses, far)
+            tree, far = bvh_of(part.triangles()), np.full(len(points), np.inf)
+            found = nearest(tree, bvh_of(np.zeros((1, 3, 3))), poses, far)
             shares.append(found.at_most.max() / part.chord)
     return max(shares)
 

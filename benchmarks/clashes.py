@@ -28,11 +28,11 @@ import scipy.spatial  # noqa: F401 - a quarter of a second that is no part of a 
 
 import hapticdb
 import records
-from hapticdb.clashes import run
-from hapticdb.exact.clash import Floats, Judged
+from hapticdb.clashes import search
+from hapticdb.exact.clash import Floats, PairResult
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels._jit import load_entries
-from hapticdb.kernels.triangles.nearest import nearest
+from hapticdb.kernels.triangles.surface_distance import nearest
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.store.base import NO_ROWS
 from hapticdb.verdicts import Kind
@@ -96,7 +96,7 @@ def measured(what: str, url: str) -> dict[str, Any]:
     load_entries()
     is_alone = what == "distances alone"
     if is_alone:
-        vars(run)["judge"] = distance
+        vars(search)["classify_pair"] = distance
     with hapticdb.open(url, read_only=is_alone) as env:
         if what == "one changed":
             env.shift([env.objects()[100].id], (0.0, 0.0, 1e-4))
@@ -120,13 +120,13 @@ def measured(what: str, url: str) -> dict[str, Any]:
 
 def distance(
     a: CollisionShape, b: CollisionShape, pose: Floats, within: float, contact: float
-) -> Judged:
+) -> PairResult:
     """Measure the distance of a pair and leave out its kind: in the place of `judge`."""
     del contact
     near = nearest(a.tree, b.tree, pose[None], np.full(1, within))
     at_least, at_most = float(near.at_least[0]), float(near.at_most[0])
     kind = Kind.APART if np.isfinite(at_most) else Kind.FAR
-    return Judged(kind, at_least, at_most, near.on_a[0], near.on_b[0])
+    return PairResult(kind, at_least, at_most, near.on_a[0], near.on_b[0])
 
 
 def main() -> None:

@@ -1,7 +1,8 @@
 """The limit of a real-time frame: the same flat loop over one dense bitmap in memory.
 
 Voxel (i, j, k) is bit ``k & 31`` of word ``(i * side + j) * side / 32 + k / 32``. Arithmetic and
-order of sums equal those of `hapticdb.kernels.resident.feeling.felt`; only the lookup differs.
+order of sums equal those of `hapticdb.kernels.resident.cell_frames.evaluate_frame`; only the lookup
+differs.
 """
 
 import numpy as np
@@ -9,7 +10,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOATS3, INT, INTS, INTS32, WORDS32_2, entry, leaf, record_of
-from hapticdb.kernels.law import (
+from hapticdb.kernels.force_law import (
     NO_WRENCH,
     NOTHING_NEAR,
     TANGENT_PLANE,
@@ -17,9 +18,9 @@ from hapticdb.kernels.law import (
     average_into,
     respond,
 )
-from hapticdb.kernels.query.contact import center_of
+from hapticdb.kernels.query.shell_keys import center_of
 from hapticdb.kernels.records.hand import RESULT
-from hapticdb.kernels.resident.cells import CLUSTERS, EMPTY_SLOT, PLACE, Cells
+from hapticdb.kernels.resident.cells import CELL_GRID, CLUSTERS, EMPTY_SLOT, Cells
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 
@@ -74,9 +75,9 @@ def dense_felt(bitmap, shell, pose, place, law, met, out):  # type: ignore[no-un
     out.hits, out.contacts, out.deepest = count, n_contacts, deepest
 
 
-@entry(types.uint32[::1], CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, record_of(RESULT, 1))
+@entry(types.uint32[::1], CLUSTERS, FLOATS3, CELL_GRID, TANGENT_PLANE, INTS, record_of(RESULT, 1))
 def dense_feel(bitmap, shell, poses, place, law, met, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
-    """`dense_felt` at poses (M, 4, 4) into out (M,) of RESULT, as `feel_kernel` does."""
+    """`dense_felt` at poses (M, 4, 4) into out (M,) of RESULT, as `evaluate_frames` does."""
     for n in range(poses.shape[0]):
         if not is_rigid(poses[n]):
             return n

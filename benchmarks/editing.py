@@ -23,11 +23,11 @@ RATE = 1000.0
 """Frames a second of the session."""
 LIFT = 5.0
 """Height in voxels by which the object is lifted."""
-LOOK = 0.0005
+GPU_QUERY = 0.0005
 """Seconds between two looks at the last frame: the resolution of the measured times."""
 PAUSE = 0.2
 """Seconds before each edit."""
-PATIENCE = 60.0
+TIMEOUT = 60.0
 """Seconds that one edit may take before the run fails."""
 
 
@@ -67,7 +67,7 @@ def edits(url: str, tool: FilePath, path: FilePath, n_edits: int) -> dict[str, A
     ):
         assert writer.stdin is not None
         assert writer.stdout is not None
-        late = threading.Timer(n_edits * PATIENCE, writer.kill)  # ends `readline` below
+        late = threading.Timer(n_edits * TIMEOUT, writer.kill)  # ends `readline` below
         late.daemon = True
         late.start()
         for _ in range(n_edits):
@@ -101,11 +101,11 @@ def revision_of(session: Session) -> int:
 
 def until_after(session: Session, revision: int) -> float:
     """Wait for a frame of a later revision; the time at which it was seen, in seconds."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while revision_of(session) <= revision:
         if time.monotonic() > deadline:
             raise SystemExit(f"no frame has felt what came after revision {revision}")
-        time.sleep(LOOK)
+        time.sleep(GPU_QUERY)
     return time.monotonic()
 
 

@@ -33,7 +33,7 @@ from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.kernels.records.cells import BUFFERS
 from hapticdb.kernels.records.hand import RESULT
-from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.cell_frames import evaluate_frames
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query.law import DistanceField
 from hapticdb.resident.frames import ResidentFrames
@@ -59,7 +59,7 @@ SHELLS = ((300, 1000), (100_000, 200), (1_000_000, 50))
 """Points of a shell, and poses of the path at which it is felt, one after another."""
 CELL_BYTES = 1 << 30
 """Bytes for cells."""
-PATIENCE = 600.0
+TIMEOUT = 600.0
 """Seconds beyond its own duration after which a command is killed."""
 
 
@@ -86,7 +86,7 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
         residency = Residency(env.store, table)
         frames = {name: ResidentFrames(residency, shell, **way) for name, way in WAYS.items()}
         frames["distance"] = ResidentFrames(residency, shell, DistanceField())
-        frames["distance"].feel(poses)  # fetches the cells that its band reaches
+        frames["distance"].evaluate(poses)  # fetches the cells that its band reaches
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
         first = frames["flat"]
         times: dict[str, list[float]] = {"dense": [], **{name: [] for name in frames}}
@@ -97,12 +97,12 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                     out = np.zeros(len(poses), RESULT)
                     started = time.perf_counter()
                     if name == "dense":
-                        place, hits = residency.place, first.hits
+                        place, hits = residency.cell_grid, first.hits
                         dense_feel(bitmap, first.clusters, poses, place, first.law, hits, out)
                     else:
                         one = frames[name]
-                        feel_kernel(
-                            table.cells, row, one.clusters, poses, residency.place, one.law,
+                        evaluate_frames(
+                            table.cells, row, one.clusters, poses, residency.cell_grid, one.law,
                             one.hits, one.missed, out,
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)
@@ -128,7 +128,7 @@ def session(
         str(Path(sys.executable).with_name("hapticdb")), "feel", url, "--tool", str(tool),
         "--device", str(path), "--rate", str(rate), "--seconds", str(seconds), "--json", *words,
     ]  # fmt: skip
-    limit = seconds + PATIENCE
+    limit = seconds + TIMEOUT
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
     if done.returncode:
         raise SystemExit(done.stderr)

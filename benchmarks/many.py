@@ -26,7 +26,7 @@ from paper.workload import sphere_shell
 
 Floats = NDArray[np.float64]
 SETTINGS = {"shared_buffers": "1GB", "max_wal_size": "4GB"}
-PATIENCE = 300.0
+TIMEOUT = 300.0
 """Seconds in which a process must answer."""
 LIFT = 5.0
 """Height in voxels by which a writer lifts an object."""
@@ -85,7 +85,7 @@ def work(pipe: Connection, url: str, poses: Floats | None, objects: Sequence[int
         if poses is not None:
             env.touch(shell, poses[0], law="plane")
         pipe.send_bytes(b"")  # ready
-        while pipe.poll(PATIENCE):
+        while pipe.poll(TIMEOUT):
             (end,) = np.frombuffer(pipe.recv_bytes())
             if poses is None:
                 pipe.send_bytes(write(env, objects[0], end).tobytes())
@@ -96,7 +96,7 @@ def work(pipe: Connection, url: str, poses: Floats | None, objects: Sequence[int
 def answers(pipes: Sequence[Connection]) -> list[Floats]:
     """What each process says next, (M, 3)."""
     for pipe in pipes:
-        if not pipe.poll(PATIENCE):
+        if not pipe.poll(TIMEOUT):
             raise SystemExit("a process did not answer")
     return [np.frombuffer(pipe.recv_bytes()).reshape(-1, 3) for pipe in pipes]
 
@@ -141,7 +141,7 @@ def measure(url: str, poses: Floats, effort: Effort) -> list[dict[str, Any]]:
         path = Path(folder, "poses.npy")
         np.save(path, poses)
         line = [sys.executable, __file__, url, str(path), json.dumps(asdict(effort))]
-        done = subprocess.run(line, check=True, stdout=subprocess.PIPE, timeout=10 * PATIENCE)
+        done = subprocess.run(line, check=True, stdout=subprocess.PIPE, timeout=10 * TIMEOUT)
     cells: list[dict[str, Any]] = json.loads(done.stdout)
     return cells
 
@@ -180,7 +180,7 @@ def cells_of(url: str, poses: Floats, effort: Effort) -> list[dict[str, Any]]:
     finally:
         for process in started:
             process.kill()
-            process.join(PATIENCE)
+            process.join(TIMEOUT)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ import hapticdb
 import records
 from batches import EXTENT, MODEL, poses_by_situation
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell, Session
-from hapticdb.batches.feeler import Feeler
+from hapticdb.batches.batch_tool import BatchTool
 from hapticdb.batches.on_gpu import GpuFrames
 from hapticdb.devices.scripted import Player
 from hapticdb.ingest.geometry import parts_of
@@ -51,7 +51,7 @@ TABLE = 2 << 30
 PACKAGES = ("numpy", "numba", "numba-cuda")
 REPEATS = 1000
 """Frames whose times are sorted."""
-PATIENCE = 5.0
+TIMEOUT = 5.0
 """Seconds of the frames of one shell on one side, at most about."""
 
 
@@ -99,16 +99,16 @@ def results_of(gpu: GpuFrames, poses: Floats) -> Floats:
     ])  # fmt: skip
 
 
-def on_processor(feeler: Feeler, poses: Floats) -> Floats:
+def on_processor(batch_tool: BatchTool, poses: Floats) -> Floats:
     """The same of frames on the processor, in one thread."""
-    frames, out = feeler._frames, np.zeros(len(poses), RESULT)  # noqa: SLF001 - measured
+    frames, out = batch_tool._frames, np.zeros(len(poses), RESULT)  # noqa: SLF001 - measured
     frames._run(poses, out, 0, len(poses))  # noqa: SLF001
     return out.view(np.float64).reshape(len(poses), -1)
 
 
-def compared(feeler: Feeler, gpu: GpuFrames, poses: Floats) -> dict[str, Any]:
+def compared(batch_tool: BatchTool, gpu: GpuFrames, poses: Floats) -> dict[str, Any]:
     """How far both are apart at poses, relative to the largest, and whether the GPU repeats."""
-    ours, theirs = results_of(gpu, poses), on_processor(feeler, poses)
+    ours, theirs = results_of(gpu, poses), on_processor(batch_tool, poses)
     again = np.concatenate([results_of(gpu, poses[n : n + 1]) for n in range(min(len(poses), 64))])
 
     def apart(part: slice) -> float:
@@ -127,9 +127,9 @@ def compared(feeler: Feeler, gpu: GpuFrames, poses: Floats) -> dict[str, Any]:
 
 
 def seconds_of(feel: Callable[[Floats], object], poses: Floats, repeats: int) -> list[float]:
-    """Seconds of one frame after another, for `PATIENCE` at most about."""
+    """Seconds of one frame after another, for `TIMEOUT` at most about."""
     times: list[float] = []
-    while sum(times) < PATIENCE and len(times) < repeats:
+    while sum(times) < TIMEOUT and len(times) < repeats:
         one = poses[len(times) % len(poses)]
         began = time.perf_counter()
         feel(one)
@@ -137,16 +137,16 @@ def seconds_of(feel: Callable[[Floats], object], poses: Floats, repeats: int) ->
     return times
 
 
-def frames_of(feeler: Feeler, poses: Floats, repeats: int) -> dict[str, Any]:
+def frames_of(batch_tool: BatchTool, poses: Floats, repeats: int) -> dict[str, Any]:
     """Check frames of one shell, and time them one by one on both."""
-    gpu = feeler._gpu  # noqa: SLF001 - measured
+    gpu = batch_tool._gpu  # noqa: SLF001 - measured
     assert gpu is not None
-    n_points = len(feeler.shell)
-    feeler.touch(poses)  # fetches the cells
+    n_points = len(batch_tool.shell)
+    batch_tool.touch(poses)  # fetches the cells
     some = poses[: max(2, min(len(poses), 10_000_000 // n_points))]
-    equality = compared(feeler, gpu, some)
-    times = seconds_of(gpu.feel, poses, repeats)
-    cpu = seconds_of(lambda one: on_processor(feeler, one[None]), poses, repeats)
+    equality = compared(batch_tool, gpu, some)
+    times = seconds_of(gpu.evaluate, poses, repeats)
+    cpu = seconds_of(lambda one: on_processor(batch_tool, one[None]), poses, repeats)
     found = {"points": n_points, "equal": equality, "gpu": percentiles(times)}
     return found | {"one_processor": percentiles(cpu)}
 
@@ -169,7 +169,7 @@ def hands_of(folder: Path, shell: PointShell, ends: Floats, *, quick: bool) -> A
 
 
 def batches_of(
-    on_gpu: Feeler, on_cpu: Feeler, poses: Floats, size: int, situation: str
+    on_gpu: BatchTool, on_cpu: BatchTool, poses: Floats, size: int, situation: str
 ) -> dict[str, Any]:
     """Poses a second, as a caller gets them, and of the launches alone."""
     gpu = on_gpu._gpu  # noqa: SLF001 - measured
@@ -195,14 +195,14 @@ def batches_of(
     return found | {f"{name}_poses_per_s": float(np.median(all_)) for name, all_ in rates.items()}
 
 
-def clearance_of(on_gpu: Feeler, on_cpu: Feeler, poses: Floats) -> dict[str, Any]:
+def clearance_of(on_gpu: BatchTool, on_cpu: BatchTool, poses: Floats) -> dict[str, Any]:
     """Poses a second whose distance is told, and how far both answers are apart."""
     rates: dict[str, float] = {}
     found = []
-    for name, feeler in (("gpu", on_gpu), ("processors", on_cpu)):
-        feeler.clearance(poses)  # fetches the cells
+    for name, batch_tool in (("gpu", on_gpu), ("processors", on_cpu)):
+        batch_tool.clearance(poses)  # fetches the cells
         began = time.perf_counter()
-        found.append(feeler.clearance(poses).distances)
+        found.append(batch_tool.clearance(poses).distances)
         rates[f"clearance_{name}_poses_per_s"] = len(poses) / (time.perf_counter() - began)
     apart = float(np.abs(found[0] - found[1]).max() / on_cpu._residency.grid.voxel_size)  # noqa: SLF001
     return rates | {"clearance_apart_voxels": apart}
@@ -239,8 +239,8 @@ def measure(
     name = getattr(cuda.current_context().device, "name", "none: simulated")
     with hapticdb.open(folder / "scene.db", read_only=True) as env:
         with (
-            env.feeler(few, budget_bytes=TABLE, device="cuda") as on_gpu,
-            env.feeler(few, budget_bytes=TABLE) as on_cpu,
+            env.batch_tool(few, budget_bytes=TABLE, device="cuda") as on_gpu,
+            env.batch_tool(few, budget_bytes=TABLE) as on_cpu,
         ):
             for situation, poses in situations.items():
                 found = batches_of(on_gpu, on_cpu, poses, batch, situation)
@@ -250,9 +250,9 @@ def measure(
         voxel = env.grid.voxel_size
         for n_points in sizes:
             shell = few if n_points == len(few) else larger(many, n_points, 0.3 * voxel)
-            with env.feeler(shell, budget_bytes=TABLE, device="cuda") as feeler:
+            with env.batch_tool(shell, budget_bytes=TABLE, device="cuda") as batch_tool:
                 touching = np.ascontiguousarray(situations["touching"][:64])
-                frames.append(frames_of(feeler, touching, repeats))
+                frames.append(frames_of(batch_tool, touching, repeats))
             ends = np.stack([situations["free"][0], touching[0]])
             hands.append(hands_of(folder, shell, ends, quick=quick))
             print(frames[-1], hands[-1], flush=True)

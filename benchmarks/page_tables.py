@@ -158,10 +158,10 @@ def gpu_batches(results: Results) -> str:
     return table([*head, "how far", "processors", "Warp within 32 voxels"], rows)
 
 
-def ways_out(results: Results) -> str:
+def removal_paths(results: Results) -> str:
     """Answer and lengths of each question; what blocks first where no way was found."""
     rows = []
-    for one in results["ways_out"]["rows"]:
+    for one in results["removal_paths"]["rows"]:
         answer, lengths = one["verdict"], [NONE] * 3
         if "length_m" in one:
             keys = ["length_m", "gap_m", "mesh_distance_m"]
@@ -219,7 +219,7 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "gpu-frames": gpu_frames,
         "gpu-hands": gpu_hands,
         "gpu-batches": gpu_batches,
-        "ways-out": ways_out,
+        "ways-out": removal_paths,
         "fits": fits,
         "scale-ahead": scale_ahead,
         "feel": lambda results: table_of(results["feel"]["cells"]),

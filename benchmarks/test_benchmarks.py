@@ -94,12 +94,12 @@ def test_the_spark_plug_comes_out_and_its_triangles_keep_the_proved_distance(
 ) -> None:
     if "CI" not in os.environ:
         pytest.importorskip("coal", reason="make peers installs it")
-    import ways_out  # noqa: PLC0415 - loads coal
+    import removal_paths  # noqa: PLC0415 - loads coal
 
     model = tmp_path / "plug.glb"
-    model.write_bytes(ways_out.plug_scene().export(file_type="glb"))
-    question = ways_out.Question(("engine/spark_plug",))
-    (row,) = ways_out.measure(tmp_path, model, 7, [question])["rows"]
+    model.write_bytes(removal_paths.plug_scene().export(file_type="glb"))
+    question = removal_paths.Question(("engine/spark_plug",))
+    (row,) = removal_paths.measure(tmp_path, model, 7, [question])["rows"]
     assert (row["verdict"], row["how"]) == ("comes out", "pull")
     assert 0.0 < row["gap_m"] <= row["mesh_distance_m"]
 

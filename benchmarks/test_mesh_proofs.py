@@ -24,9 +24,9 @@ from batch_peers import tree_of_boxes
 from hapticdb import PointShell
 from hapticdb.exact.sweep import sweep
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.kernels.surfaces.sides import triangle_tree
-from hapticdb.kernels.triangles.nearest import nearest
-from hapticdb.kernels.triangles.sweeping import MEETING
+from hapticdb.kernels.surfaces.triangle_bvh import triangle_bvh
+from hapticdb.kernels.triangles.path_distance import MEETING
+from hapticdb.kernels.triangles.surface_distance import nearest
 from hapticdb.mesh import read_file
 
 if "CI" in os.environ:
@@ -81,8 +81,8 @@ def test_close_triangles_of_assemblies_are_never_told_too_far(name: str) -> None
     n_equal, zero, here = 0, np.zeros(1, dtype=np.int64), np.eye(4)
     for a, b in zip(mine, others, strict=True):
         found = nearest(
-            triangle_tree(a[None], zero),
-            triangle_tree(b[None], zero),
+            triangle_bvh(a[None], zero),
+            triangle_bvh(b[None], zero),
             here[None],
             np.array([np.inf]),
         )

@@ -16,7 +16,7 @@ from PIL import ImageDraw
 import hapticdb
 from hapticdb.grid import GridOptions
 from hapticdb.pictures.canvas import Canvas
-from hapticdb.pictures.clashes import PAPER, TINTS
+from hapticdb.pictures.clash_page import PAPER, TINTS
 
 Floats = NDArray[np.float64]
 SIZE = (220, 150)

@@ -21,8 +21,8 @@ import hapticdb
 from hapticdb import Environment, GridOptions, ImportOptions
 from hapticdb.page import colours, tools
 from hapticdb.page.drawing import put_at
-from hapticdb.page.process import new_server, stop
-from hapticdb.page.scene.browser import BrowserScene
+from hapticdb.page.page_process import new_server, stop
+from hapticdb.page.scene.browser_scene import BrowserScene
 from hapticdb.page.scene.view import SceneView
 from hapticdb.poses import quaternion_of
 from hapticdb.sample import write_sample
@@ -40,7 +40,7 @@ LIFTS = 10
 """Pictures of each part that moves."""
 FRAME_MS, REST_MS = 110, 1400
 """How long a picture is shown, and the last one of a scene."""
-PATIENCE = 120.0
+TIMEOUT = 120.0
 """Seconds that each wait lasts at most."""
 STRIP = 84
 """Height of the strip with the curve, pixels."""
@@ -117,8 +117,8 @@ def spanner(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
     """Pictures of the spanner that slides under the distance law, with its force."""
     shell = stage.env.tool(tool)
     poses = hapticdb.read_poses(path)[FIRST:LAST]
-    felt = stage.env.touch(shell, poses=poses).forces
-    forces = np.linalg.norm(felt, axis=1)
+    batch = stage.env.touch(shell, poses=poses).forces
+    forces = np.linalg.norm(batch, axis=1)
     held = tools.from_files([str(tool)], stage.env.grid.voxel_size, has_distances=True)[0]
     scene = stage.client.scene
     node = scene.add_mesh_simple(
@@ -138,7 +138,7 @@ def spanner(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
         place = poses[n][:3, 3]
         with stage.client.atomic():
             put_at(node, np.concatenate([place, quaternion_of(poses[n][None, :3, :3])[0]]))
-            arrow.points = np.array([[place, place + felt[n] / NEWTONS_A_METRE]], dtype=np.float32)
+            arrow.points = np.array([[place, place + batch[n] / NEWTONS_A_METRE]], dtype=np.float32)
         picture = _curve(_drawn(stage), forces, n, 1.1 * float(forces.max()))
         yield _captioned(picture, "Feel: a spanner slides over the car")
     node.remove()
@@ -166,11 +166,11 @@ def moving(
 def lid(stage: _Stage) -> Iterator[Image.Image]:
     """Pictures of the trunk lid on its removal path."""
     found = hapticdb.extract(stage.env, "body/trunk_lid")
-    if found.way is None:
+    if found.path is None:
         raise SystemExit("the trunk lid does not come out")
     ids = [obj.id for obj in found.parts]
-    text = f"Extract: the trunk lid comes out, {found.way.length:.2f} m, proved"
-    yield from moving(stage, ids, found.way.poses, FREE, text, "rear")
+    text = f"Extract: the trunk lid comes out, {found.path.length:.2f} m, proved"
+    yield from moving(stage, ids, found.path.poses, FREE, text, "rear")
 
 
 def wheel(stage: _Stage) -> Iterator[Image.Image]:
@@ -209,13 +209,13 @@ def main() -> None:
         server = new_server()
         server.scene.world_axes.visible = False
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
-        page.set_default_timeout(1000.0 * PATIENCE)
+        page.set_default_timeout(1000.0 * TIMEOUT)
         with (
             closing(SceneView(server, str(url))) as view,
             hapticdb.open(url, read_only=True) as env,
         ):
             page.goto(f"http://127.0.0.1:{server.get_port()}/?fixedDpr=1&hideViserLogo")
-            end = time.monotonic() + PATIENCE
+            end = time.monotonic() + TIMEOUT
             while (view.contents.waiting() or not server.get_clients()) and time.monotonic() < end:
                 page.wait_for_timeout(500)
             page.add_style_tag(

@@ -69,20 +69,20 @@ def learned(given: argparse.Namespace) -> dict[str, NDArray[np.generic]]:
         )
         shell = env.shell(*given.words, points=given.points, seed=given.seed)
         poses = displacements(rng, given.poses, shell, env.grid.voxel_size)
-        with env.feeler(shell, exclude=given.words, law=law, device=given.on) as feeler:
+        with env.batch_tool(shell, exclude=given.words, law=law, device=given.on) as batch_tool:
             for first in range(0, len(poses), PIECE):
                 part = poses[first : first + PIECE]
-                felt = feeler.touch(part, objects=True)
+                batch = batch_tool.touch(part, objects=True)
                 pieces.append(
                     {
-                        "force": felt.forces,
-                        "torque": felt.torques,
-                        "hits": felt.hits,
-                        "contacts": felt.n_contacts,
-                        "clearance": feeler.clearance(part).distances,
-                        "ids": felt.ids,
-                        "counts": np.diff(felt.offsets),
-                        "revision": np.array([felt.revision]),
+                        "force": batch.forces,
+                        "torque": batch.torques,
+                        "hits": batch.hits,
+                        "contacts": batch.n_contacts,
+                        "clearance": batch_tool.clearance(part).distances,
+                        "ids": batch.ids,
+                        "counts": np.diff(batch.offsets),
+                        "revision": np.array([batch.revision]),
                     }
                 )
     found = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}

@@ -1,6 +1,6 @@
 """Child processes of tests and other waits: each wait has a limit.
 
-`child` and `finished` start processes and kill each with its group after `PATIENCE`. The script
+`child` and `finished` start processes and kill each with its group after `TIMEOUT`. The script
 `watchdog` ends every process that is left when the run is over, however the run ended.
 """
 
@@ -20,7 +20,7 @@ from typing import IO, Any
 
 import pytest
 
-PATIENCE = 300.0
+TIMEOUT = 300.0
 """Seconds after which a child is killed and a wait fails. It is many times what a test takes on a
 busy machine, and less than the 20 minutes after which pytest itself ends (pyproject.toml)."""
 RUN = "HAPTICDB_TEST_RUN"
@@ -75,7 +75,7 @@ def _end_run(dog: "subprocess.Popen[bytes]", pid: int) -> None:
     if os.getpid() == pid:  # a forked copy of this process must not do it
         assert dog.stdin is not None
         dog.stdin.close()
-        dog.wait(PATIENCE)
+        dog.wait(TIMEOUT)
 
 
 def end_forked(pid: int) -> None:
@@ -88,12 +88,12 @@ def end_forked(pid: int) -> None:
 def child(
     command: Sequence[str],
     *,
-    patience: float = PATIENCE,
+    timeout: float = TIMEOUT,
     **how: Any,  # noqa: ANN401 - as `subprocess.Popen` takes it; no input and pipes unless given
 ) -> Iterator["subprocess.Popen[str]"]:
     """A child process in a process group of its own. The end of the block waits for its end.
 
-    The child is killed with its group when the block fails, and after `patience`. Then all its
+    The child is killed with its group when the block fails, and after `timeout`. Then all its
     pipes close, so no read from them waits for ever.
     """
     streams = {"stdin": subprocess.DEVNULL, "stdout": PIPE, "stderr": PIPE}
@@ -104,7 +104,7 @@ def child(
         late.set()
         _kill(process)
 
-    timer = threading.Timer(patience, give_up)
+    timer = threading.Timer(timeout, give_up)
     timer.daemon = True
     timer.start()
     try:
@@ -118,7 +118,7 @@ def child(
         timer.cancel()
         _kill(process)
     if late.is_set():
-        pytest.fail(f"killed, since it did not end within {patience:g} s: {command}")
+        pytest.fail(f"killed, since it did not end within {timeout:g} s: {command}")
 
 
 def _kill(process: "subprocess.Popen[str]") -> None:
@@ -130,12 +130,12 @@ def finished(
     command: Sequence[str],
     *,
     check: bool = False,
-    patience: float = PATIENCE,
+    timeout: float = TIMEOUT,
     **how: Any,  # noqa: ANN401 - as `child` takes it
 ) -> "subprocess.CompletedProcess[str]":
     """Run a child process to its end; return its exit code and what it printed."""
-    with child(command, patience=patience, **how) as process:
-        out, err = process.communicate(timeout=patience)
+    with child(command, timeout=timeout, **how) as process:
+        out, err = process.communicate(timeout=timeout)
     if check:
         assert process.returncode == 0, err
     return subprocess.CompletedProcess(command, process.returncode, out, err)
@@ -156,10 +156,10 @@ def exit_code(pid: int) -> int:
     return found[0]
 
 
-def until(claim: Callable[[], object], every: float = 0.01, patience: float = PATIENCE) -> None:
-    deadline = time.monotonic() + patience
+def until(claim: Callable[[], object], every: float = 0.01, timeout: float = TIMEOUT) -> None:
+    deadline = time.monotonic() + timeout
     while not claim():
-        assert time.monotonic() < deadline, f"it does not hold after {patience:g} s"
+        assert time.monotonic() < deadline, f"it does not hold after {timeout:g} s"
         time.sleep(every)
 
 
@@ -182,10 +182,10 @@ def named(pid: int) -> str:
 
 
 def joined(thread: threading.Thread) -> None:
-    thread.join(PATIENCE)
-    assert not thread.is_alive(), f"it did not end within {PATIENCE:g} s"
+    thread.join(TIMEOUT)
+    assert not thread.is_alive(), f"it did not end within {TIMEOUT:g} s"
 
 
 def received(connection: Connection) -> Any:  # noqa: ANN401 - whatever was sent
-    assert connection.poll(PATIENCE), f"no word within {PATIENCE:g} s"
+    assert connection.poll(TIMEOUT), f"no word within {TIMEOUT:g} s"
     return connection.recv()

@@ -34,7 +34,7 @@ if (!new URLSearchParams(location.search).has("token"))
 """
 """Run before the page's own code. Else viser draws fewer pixels where it finds that it is slow, and
 two pictures of the same scene differ."""
-PATIENCE = 120.0
+TIMEOUT = 120.0
 """Seconds that any wait lasts at most: drawing in software is slow on a busy machine."""
 
 
@@ -53,17 +53,17 @@ def new_page(browser: Browser, address: str) -> Page:
     """Open an address as a person of its own does: no cookie is shared; drawn with all pixels."""
     page = browser.new_context(viewport=SIZE).new_page()
     page.add_init_script(FULL_RESOLUTION)
-    page.set_default_timeout(1000.0 * PATIENCE)
+    page.set_default_timeout(1000.0 * TIMEOUT)
     page.goto(address)
     return page
 
 
 def until(holds: Callable[[], bool], what: str, page: Page) -> None:
     """Wait until something holds, and let the page go on meanwhile."""
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not holds():
         assert time.monotonic() < end, (
-            f"{what}: not within {PATIENCE:g} s; the page says: "
+            f"{what}: not within {TIMEOUT:g} s; the page says: "
             + (page.locator("body").inner_text()[-600:])
         )
         page.wait_for_timeout(100)

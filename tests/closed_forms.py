@@ -14,16 +14,16 @@ from hapticdb.kernels.records.cells import CONTROL, READER, REQUEST
 from hapticdb.kernels.records.layout import pose_numbers, views_of
 from hapticdb.kernels.resident.cells import (
     SCRATCH_ROWS,
+    CellGrid,
     Cells,
     Clusters,
-    Place,
     key_of_cell,
     spread_key,
 )
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DISTANCE
-from hapticdb.resident.held import spheres_of
+from hapticdb.resident.point_runs import spheres_of
 from hapticdb.session.states import PeriodClock, SessionState
 
 Floats = NDArray[np.float64]
@@ -99,7 +99,7 @@ class Field(NamedTuple):
     """Resident cells and the grid in which they lie, about the world's origin."""
 
     cells: Cells
-    place: Place
+    place: CellGrid
     distance: Distance
 
 
@@ -137,7 +137,7 @@ def field_of(distance: Distance, size: float, n_cells: ArrayLike = (2, 2, 2)) ->
     )  # fmt: skip
     filled = np.arange(1, len(payload))
     mark_near_voxels(filled, np.array(payload), cells.masks, cells.words, near)
-    return Field(cells, Place(origin, origin, origin, size, float(side)), distance)
+    return Field(cells, CellGrid(origin, origin, origin, size, float(side)), distance)
 
 
 def enter(keys: NDArray[np.int64], slots: NDArray[np.int32], key: int, slot: int) -> None:

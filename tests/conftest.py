@@ -58,21 +58,21 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Leave out, or for the long tests, what repeats a test on another version or engine."""
     older = set(map(named, FOUND[1:]))
     kept: list[pytest.Item] = []
-    left_out: list[pytest.Item] = []
+    excluded: list[pytest.Item] = []
     for item in items:
         name, words = item.path.name, getattr(getattr(item, "callspec", None), "id", "")
         is_older = not older.isdisjoint(words.split("-"))
         is_wanted = name in OLDER or draws.is_every()
-        is_left_out = is_older and (item.path.parent.name in NEWEST or not is_wanted)
+        is_excluded = is_older and (item.path.parent.name in NEWEST or not is_wanted)
         kinds = {"-".join(kind) for kind in KINDS}
         is_other_kind = any(kind in words for kind in kinds - QUICK_KINDS)
         if name == "test_partitions.py" and is_other_kind and not draws.is_every():
-            is_left_out = True
-        (left_out if is_left_out else kept).append(item)
+            is_excluded = True
+        (excluded if is_excluded else kept).append(item)
         is_other = name.startswith("test_contract_") and name != "test_contract_sqlite.py"
         if is_older or (is_other and is_other_kind):
             item.add_marker(pytest.mark.long)
-    config.hook.pytest_deselected(items=left_out)
+    config.hook.pytest_deselected(items=excluded)
     items[:] = kept
 
 
@@ -115,7 +115,7 @@ def _files_are_parsed_here() -> Iterator[None]:
         return parse(Path(request["path"]), request["metres"], request["chord"])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reader, "_ask_child", ask)
+        patch.setattr(reader, "_run_child", ask)
         yield
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import hapticdb
 from assemblies import write_obj
 from hapticdb import Environment, PointShell
-from hapticdb.exact.clash import Judged, judge
+from hapticdb.exact.clash import PairResult, classify_pair
 from hapticdb.exact.sweep import sweep
 from hapticdb.exact.swept import Swept
 from hapticdb.pointshell.shape import CollisionShape
@@ -180,10 +180,10 @@ def swept(
     )
 
 
-def judged(a: Floats, b: Floats, contact: float = CONTACT) -> Judged:
+def judged(a: Floats, b: Floats, contact: float = CONTACT) -> PairResult:
     """Judge two surfaces; lengths of the result in millimetres."""
     shapes = [CollisionShape(MM * triangles) for triangles in (a, b)]
-    found = judge(shapes[0], shapes[1], np.eye(4), MM, MM * contact)
+    found = classify_pair(shapes[0], shapes[1], np.eye(4), MM, MM * contact)
     return found._replace(at_least=found.at_least / MM, at_most=found.at_most / MM)
 
 

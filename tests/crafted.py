@@ -7,17 +7,17 @@ import apsw
 import numpy as np
 
 from hapticdb import Grid
-from hapticdb.mesh import packing
+from hapticdb.mesh import surface_packing
 from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.store.base import Layout
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 from voxels import floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 7)
 NANS = np.full(6, np.nan).tobytes().hex()
 UPSIDE_DOWN = np.array([1.0, 1, 1, 0, 0, 0]).tobytes().hex()
 DESCENDING = np.array([9, 3], np.int64).tobytes().hex()
-BALL = packing.pack(np.eye(3), np.array([[0, 1, 2]])).hex()
+BALL = surface_packing.pack(np.eye(3), np.array([[0, 1, 2]])).hex()
 VIEW = "ALTER TABLE {0} RENAME TO t; CREATE VIEW {0} AS SELECT * FROM t"
 CRAFTED = {
     "attributes that are no JSON": "UPDATE object SET attributes = '{'",

@@ -18,7 +18,7 @@ from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.paper.strategies import Strategy
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres.connecting import connection
+from hapticdb.store.postgres.connecting import server_connection
 from postgres_servers import Binaries, Server
 from servers import FOUND, kill, named
 from validity import Contents, contents, valid_contents
@@ -98,7 +98,7 @@ def url(server: Server) -> str:
 
 @pytest.fixture
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connection, "RECONNECT_SECONDS", SOON_S)
+    monkeypatch.setattr(server_connection, "RECONNECT_SECONDS", SOON_S)
 
 
 def moments(seed: int) -> list[tuple[int, float]]:

@@ -45,10 +45,10 @@ def found_in(url: Path, part: str, **options: Any) -> Extraction:  # noqa: ANN40
 
 def is_out(found: Extraction, url: Path) -> bool:
     """Whether the part's box has left the box of all else at the end of the path."""
-    assert found.way is not None
+    assert found.path is not None
     with hapticdb.open(url, read_only=True) as env:
         others = np.array([o.bounds for o in env.objects() if o.id != found.parts[0].id])
-    placed = found.shell.points @ found.way.poses[-1][:3, :3].T + found.way.poses[-1][:3, 3]
+    placed = found.shell.points @ found.path.poses[-1][:3, :3].T + found.path.poses[-1][:3, 3]
     low, high = others[:, 0].min(axis=0), others[:, 1].max(axis=0)
     return bool((placed.min(axis=0) > high).any() or (placed.max(axis=0) < low).any())
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from children import exit_code
 from hapticdb import Grid
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 from voxels import blob, floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 6)

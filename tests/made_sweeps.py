@@ -59,7 +59,7 @@ def swept(path: ToolPath | None = None, **changed: Any) -> Swept:  # noqa: ANN40
         "contact": 5e-5,
         "overlap": 0.0,
         "objects": 3,
-        "looks": 40,
+        "queries": 40,
         "revision": 1,
         "elapsed": 0.1,
     }

@@ -144,7 +144,7 @@ def main() -> int:
     is_bad = False
     for n in range(len(FORMATS)):
         command = [sys.executable, __file__, str(given.files), f"--format={n}"]
-        ended = finished(command, stderr=None, patience=limit)
+        ended = finished(command, stderr=None, timeout=limit)
         print(ended.stdout, end="", flush=True)
         is_bad |= ended.returncode != 0
     print(f"{given.files:,} files")

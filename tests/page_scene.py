@@ -11,7 +11,7 @@ import trimesh
 import hapticdb
 from children import until
 from hapticdb.page.connection import PageConnection, PageRequest, Visitor
-from hapticdb.page.process import new_server, open_page
+from hapticdb.page.page_process import new_server, open_page
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
 from page_person import PagePerson

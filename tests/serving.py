@@ -15,9 +15,9 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
-from children import PATIENCE, joined
+from children import TIMEOUT, joined
 from hapticdb.server.access import Role
-from hapticdb.server.running import run
+from hapticdb.server.lifecycle import run
 from hapticdb.server.served import Serving
 
 PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
@@ -50,7 +50,7 @@ class Running:
         self, path: str, method: str = "GET", body: bytes = b"", **headers: str
     ) -> tuple[HTTPResponse, bytes]:
         """Send a request; its answer and the answer's body. Underscores in names are hyphens."""
-        connection = HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT)
         named = {name.replace("_", "-"): value for name, value in headers.items()}
         try:
             connection.request(method, self.prefix + path, body or None, named)
@@ -75,7 +75,7 @@ def browser_at(place: str, **headers: str) -> ClientConnection:
         del shown["Origin"]
     return connect(
         f"ws://{place}", subprotocols=PROTOCOL, additional_headers=shown, proxy=None,
-        compression=None, open_timeout=PATIENCE,
+        compression=None, open_timeout=TIMEOUT,
     )  # fmt: skip
 
 
@@ -109,7 +109,7 @@ def running(serving: Serving) -> Iterator[Running]:
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
-    assert ready.wait(PATIENCE)
+    assert ready.wait(TIMEOUT)
     if errors:
         joined(thread)
         raise errors[0]
@@ -127,7 +127,7 @@ def sent(connection: Connection, message: object) -> None:
     connection.send(msgspec.msgpack.encode(message))
 
 
-def messages(connection: Connection, seconds: float = PATIENCE) -> list[dict[str, object]]:
+def messages(connection: Connection, seconds: float = TIMEOUT) -> list[dict[str, object]]:
     """Messages of the next frame of the page."""
     import zstandard  # noqa: PLC0415 - comes with viser
 
@@ -151,7 +151,7 @@ def close_code(connection: Connection) -> int:
     """Read until the server closes the connection; its code."""
     try:
         for _ in range(100_000):
-            connection.recv(timeout=PATIENCE)
+            connection.recv(timeout=TIMEOUT)
     except ConnectionClosed as closed:
         return 1006 if closed.rcvd is None else closed.rcvd.code
     raise AssertionError("the server goes on")

@@ -18,9 +18,9 @@ from command_line import Run, command, poses, refused
 from disassembly_scenes import STACK
 from disassembly_scenes import made as made_of
 from hapticdb import ImportOptions, disassemble, find_clashes
-from hapticdb.batches import feeler
-from hapticdb.clashes import run as clashing
-from hapticdb.cluster import workers as cluster
+from hapticdb.batches import batch_tool
+from hapticdb.clashes import search as clashing
+from hapticdb.cluster import scheduler as cluster
 from hapticdb.errors import ClusterError, UsageError
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.transfer import copy_environment
@@ -88,7 +88,7 @@ def test_imports_and_clashes_by_two_workers_are_those_of_one_process(
 def test_touches_by_workers_are_those_of_one_process(
     scheduler: str, scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feeler, "TASK", 7)
+    monkeypatch.setattr(batch_tool, "TASK", 7)
     poses(scene.with_name("way.csv"), *((0.002 * n, 0.0, 0.0635) for n in range(50)))
     asked = ("touch", scene.name, "--tool", "tool.npz", "--poses", "way.csv", "--exclude", "box1")
     assert run(*asked, "--out", "here.npz")[0] == 0
@@ -114,9 +114,9 @@ def test_an_order_by_workers_is_that_of_one_process(scheduler: str, tmp_path: Pa
     assert all(done <= known for done, known in told)
     assert [step.excluded for step in there.steps] == [step.excluded for step in here.steps]
     for one, other in zip(here.steps, there.steps, strict=True):
-        assert one.found.way is not None
-        assert other.found.way is not None
-        assert one.found.way.poses.tobytes() == other.found.way.poses.tobytes()
+        assert one.found.path is not None
+        assert other.found.path is not None
+        assert one.found.path.poses.tobytes() == other.found.path.poses.tobytes()
     assert len(there.steps) == 3
 
 

@@ -17,7 +17,7 @@ from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.mesh import Part
-from hapticdb.mesh.packing import pack
+from hapticdb.mesh.surface_packing import pack
 from hapticdb.store.base import Band
 from voxels import blob, voxel_object, with_distances
 

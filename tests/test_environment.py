@@ -24,7 +24,7 @@ from assemblies import (
 from hapticdb import Environment, Object, PointShell
 from hapticdb.check import check_environment
 from hapticdb.grid import CurveName
-from hapticdb.ingest import moving
+from hapticdb.ingest import object_moves
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh import parse_in_process
 from hapticdb.paper.cost_model import machine_name
@@ -69,7 +69,7 @@ def test_objects_are_those_of_the_newest_revision(env: Environment, tmp_path: Pa
         assert [obj.id for obj in env.objects()] == [ids[0], *ids[2:]]
         env.remove(ids[2])
         assert [obj.id for obj in env.find("*")] == [ids[0], *ids[3:]]
-        assert [obj.id for obj in other.felt(exclude=[ids[0]])] == ids[3:]
+        assert [obj.id for obj in other.select(exclude=[ids[0]])] == ids[3:]
     env.objects().clear()
     assert [obj.id for obj in env.objects()] == [ids[0], *ids[3:]]
 
@@ -224,7 +224,7 @@ def test_a_move_by_another_while_the_part_is_read_leaves_no_stray_rows(
         other.move(1, placement(0.1, 0, 0))
         return parts_of(store, objects)
 
-    monkeypatch.setattr(moving, "parts_of", read_while_another_moves)
+    monkeypatch.setattr(object_moves, "parts_of", read_while_another_moves)
     moved = env.move(1, placement(0, 0.1, 0))
     assert moved.revision == 3
     np.testing.assert_array_equal(moved.transform, placement(0, 0.1, 0))

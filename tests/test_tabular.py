@@ -11,7 +11,7 @@ import pytest
 
 import hapticdb
 from assemblies import row_of_boxes
-from hapticdb.batches.result import ClearanceBatch, Named, TouchBatch
+from hapticdb.batches.batch_results import ClearanceBatch, TouchBatch, TouchedIds
 from hapticdb.errors import FileError, MissingExtraError, UsageError
 from hapticdb.query.law import PLANE
 from hapticdb.tabular.schema import COLUMNS, WRENCH
@@ -23,7 +23,7 @@ def touches() -> TouchBatch:
     made = TouchBatch(2, PLANE)
     made.forces[1] = 0.1, -2.0, 1e-300
     known = {1: thing("=bolt", 1), 4: thing("nut", 4)}
-    made.named = Named(np.array([0, 0, 2]), np.array([1, 4]), known)
+    made.named = TouchedIds(np.array([0, 0, 2]), np.array([1, 4]), known)
     return made
 
 

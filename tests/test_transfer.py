@@ -22,7 +22,7 @@ from hapticdb.ingest import geometry
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
 from hapticdb.store.base import Band, Rows
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 from hapticdb.transfer import CopyReport
 from voxels import blob, voxel_object, with_distances, write_voxels
 

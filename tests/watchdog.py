@@ -19,7 +19,7 @@ from pathlib import Path
 
 TICK_S = 0.5
 """Seconds between checks that pytest lives; a process forked from it may hold the pipe open."""
-PATIENCE_S = 20.0
+TIMEOUT_S = 20.0
 """Seconds for a server to shut down; after that it is killed."""
 
 
@@ -62,7 +62,7 @@ class Leftovers:
 
     def end(self) -> None:
         """End processes until two searches in a row find none; then remove the folder."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         mark = f"HAPTICDB_TEST_RUN={self._run}"
         n_quiet, asked = 0, set[int]()
         while n_quiet < 2:  # a process may have started another between two looks
@@ -77,7 +77,7 @@ class Leftovers:
                 _send(pid, signal.SIGKILL if is_late else signal.SIGQUIT)
             asked.update(servers)
             n_quiet = 0 if servers or others else n_quiet + 1
-            if is_late and time.monotonic() > deadline + PATIENCE_S:
+            if is_late and time.monotonic() > deadline + TIMEOUT_S:
                 break  # cannot be killed: stuck in the kernel
             time.sleep(0.05)
         shutil.rmtree(self._run, ignore_errors=True)

@@ -16,7 +16,7 @@ from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.records.layout import pose_numbers
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE
-from hapticdb.resident.held import clusters_of
+from hapticdb.resident.point_runs import clusters_of
 from hapticdb.session.states import PeriodClock, SessionState
 
 Floats = NDArray[np.float64]

@@ -93,8 +93,8 @@ class Ground:
         steps = np.linspace(-reach, reach, 2 * n + 1) * self.size
         lattice = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3) + place
         found = np.full(1 << (8 * len(lattice) - 1).bit_length(), UNKNOWN, dtype=np.int64)
-        kernels.cells_met(
-            lattice, 0, 0, 0.0, np.eye(4)[None], self.residency.place, found, len(found) // 2
+        kernels.cells_in_reach(
+            lattice, 0, 0, 0.0, np.eye(4)[None], self.residency.cell_grid, found, len(found) // 2
         )
         self.residency.make_resident(found[found >= 0])
 

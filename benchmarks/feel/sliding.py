@@ -12,7 +12,7 @@ from feel.figures import largest_step, ripple
 from feel.ground import Ground
 from feel.scenes import Scene, convex_edge, plane, planes, slope_axes
 from feel.tools import ball, flat_tool
-from hapticdb.kernels.field.law import ONSET
+from hapticdb.kernels.field.distance_law import ONSET
 from hapticdb.pointshell.shell import PointShell
 
 Floats = NDArray[np.float64]

@@ -17,7 +17,7 @@ from feel.scenes import (
     planes,
 )
 from feel.tools import flat_tool
-from hapticdb.kernels.field.law import ONSET
+from hapticdb.kernels.field.distance_law import ONSET
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 

@@ -13,7 +13,7 @@ from feel.figures import largest_step
 from feel.ground import Ground
 from feel.tools import ball
 from hapticdb.environment import Environment
-from hapticdb.kernels.field.law import ONSET
+from hapticdb.kernels.field.distance_law import ONSET
 from slide_paths import slide_along
 
 Floats = NDArray[np.float64]

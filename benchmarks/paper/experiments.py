@@ -14,7 +14,7 @@ from hapticdb.kernels.records.hand import RESULT
 from hapticdb.paper.grouping import cbgroup
 from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.paper.strategies import Strategy
-from hapticdb.query.frame import locate
+from hapticdb.query.haptic_query import locate
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -37,7 +37,7 @@ RESIDENT_BYTES = 256 << 20
 """Bytes for the cells that a bitmap is made of. They are given back before it is measured."""
 LEAST_GROUPED = 5
 """Least number of times that keys are grouped; the first does not count."""
-NOTHING_ASKED = Query("bitmap", 0, 0, 0, 0.0)
+NO_QUERY = Query("bitmap", 0, 0, 0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def in_memory(env: Environment, tasks: Sequence[Task], budget: Budget) -> list[C
         with CellTable.create(RESIDENT_BYTES) as table:
             residency = Residency(env.store, table)
             frames = ResidentFrames(residency, task.shell, run=0)
-            frames.feel(task.poses)
+            frames.evaluate(task.poses)
             bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
         cell: Cell = {
             "engine": "memory",
@@ -175,11 +175,11 @@ def in_memory(env: Environment, tasks: Sequence[Task], budget: Budget) -> list[C
 
 def _against(bitmap: NDArray[np.uint32], frames: ResidentFrames) -> Callable[[Floats], Query]:
     """Frames against a bitmap; nothing is asked."""
-    out, place = np.zeros(1, RESULT), frames.residency.place
+    out, place = np.zeros(1, RESULT), frames.residency.cell_grid
 
     def frame(pose: Floats) -> Query:
         dense_feel(bitmap, frames.clusters, pose[None], place, frames.law, frames.hits, out)
-        return NOTHING_ASKED
+        return NO_QUERY
 
     return frame
 
@@ -216,5 +216,5 @@ def _measure(
     subject: Subject, task: Task, alternatives: Sequence[Alternative], budget: Budget
 ) -> list[Cell]:
     return in_turns(
-        alternatives, task.poses, limit_s=budget.cell_s, asked_rows=subject.asked_rows(task)
+        alternatives, task.poses, limit_s=budget.cell_s, requested_rows=subject.requested_rows(task)
     )

@@ -60,10 +60,10 @@ class Alternative:
             self.poses.append(index)
             self.spent_s += elapsed_us / 1e6
 
-    def record(self, asked_rows: Sequence[int] | None = None) -> Cell:
+    def record(self, requested_rows: Sequence[int] | None = None) -> Cell:
         """The cell with everything measured.
 
-        asked_rows : rows under each pose's own keys; what is read beyond them is a false row.
+        requested_rows : rows under each pose's own keys; what is read beyond them is a false row.
         """
         queries = self.queries
         found: Cell = {
@@ -73,8 +73,8 @@ class Alternative:
             "ranges": float(np.mean([query.ranges for query in queries])),
             "rows": float(np.mean([query.rows for query in queries])),
         }
-        if asked_rows is not None:
-            asked = float(np.mean([asked_rows[index] for index in self.poses]))
+        if requested_rows is not None:
+            asked = float(np.mean([requested_rows[index] for index in self.poses]))
             found["false_rows"] = found["rows"] - asked
         return found
 
@@ -85,13 +85,13 @@ def in_turns(
     *,
     limit_s: float,
     warm: int = WARM_FRAMES,
-    asked_rows: Sequence[int] | None = None,
+    requested_rows: Sequence[int] | None = None,
 ) -> list[Cell]:
     """Measure all alternatives over all poses and return a cell for each.
 
     poses (M, 4, 4): world_from_tool; limit_s : seconds of frames that each may take: one that
     reaches it stops, and its cell is marked `cut_short`; warm : untimed frames of each before;
-    asked_rows (M,): rows under each pose's own keys: what is read beyond them is a false hit.
+    requested_rows (M,): rows under each pose's own keys: what is read beyond them is a false hit.
 
     The poses are cut into chunks. Every alternative runs each chunk once. In one turn the
     alternatives run different chunks, in an order drawn anew for each turn. So an alternative does
@@ -113,7 +113,7 @@ def in_turns(
             alternatives[n].run(poses, chunk, limit_s)
     cells = []
     for alternative in alternatives:
-        cell = alternative.record(asked_rows)
+        cell = alternative.record(requested_rows)
         cell["cut_short"] = len(alternative.queries) < len(poses)
         cells.append(cell)
     return cells

@@ -13,7 +13,7 @@ from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.paper.strategies import Strategies, Strategy
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 from paper.measure import Alternative, Cell, Pose
 from paper.workload import Task
 
@@ -81,7 +81,7 @@ class Subject:
         }
         return Alternative(cell, asking(query or self.query(), task.shell, strategy, law, gap))
 
-    def asked_rows(self, task: Task) -> list[int]:
+    def requested_rows(self, task: Task) -> list[int]:
         """Rows under each pose's own keys."""
         ask = asking(self.query(), task.shell, "array", "plane", None)
         return [ask(pose).rows for pose in task.poses]

@@ -264,7 +264,7 @@ def speed(results: Results) -> str:
 
 def exactness(results: Results) -> str:
     """How far what is proved is from what coal measures, and how many pairs were told."""
-    rows = [row for row in results["ways_out"]["rows"] if "length_m" in row]
+    rows = [row for row in results["removal_paths"]["rows"] if "length_m" in row]
     apart = [1e3 * (row["mesh_distance_m"] - row["gap_m"]) for row in rows]
     every = next(c for c in cells_of(results, "clashes") if c["search"] == "everything")
     told = every["told"]

@@ -24,14 +24,14 @@ from typing import TYPE_CHECKING
 from hapticdb import errors as errors
 
 if TYPE_CHECKING:
-    from hapticdb.batches.feeler import Feeler as Feeler
-    from hapticdb.batches.result import ClearanceBatch as ClearanceBatch
-    from hapticdb.batches.result import TouchBatch as TouchBatch
+    from hapticdb.batches.batch_results import ClearanceBatch as ClearanceBatch
+    from hapticdb.batches.batch_results import TouchBatch as TouchBatch
+    from hapticdb.batches.batch_tool import BatchTool as BatchTool
     from hapticdb.check import CheckReport as CheckReport
     from hapticdb.check import check_environment as check_environment
-    from hapticdb.clashes.result import Clashes as Clashes
-    from hapticdb.clashes.run import accept_clash as accept_clash
-    from hapticdb.clashes.run import find_clashes as find_clashes
+    from hapticdb.clashes.clash_results import Clashes as Clashes
+    from hapticdb.clashes.search import accept_clash as accept_clash
+    from hapticdb.clashes.search import find_clashes as find_clashes
     from hapticdb.devices.handle import Handle as Handle
     from hapticdb.difference import Difference as Difference
     from hapticdb.difference import diff_environments as diff_environments
@@ -42,16 +42,16 @@ if TYPE_CHECKING:
     from hapticdb.exact.swept import Swept as Swept
     from hapticdb.extraction.disassembly import Disassembly as Disassembly
     from hapticdb.extraction.disassembly import disassemble as disassemble
-    from hapticdb.extraction.result import Extraction as Extraction
-    from hapticdb.extraction.run import extract as extract
+    from hapticdb.extraction.extraction_results import Extraction as Extraction
+    from hapticdb.extraction.removal_search import extract as extract
     from hapticdb.grid import Grid as Grid
     from hapticdb.grid import GridOptions as GridOptions
     from hapticdb.ingest.files import FileReport as FileReport
     from hapticdb.ingest.files import ImportOptions as ImportOptions
     from hapticdb.ingest.files import import_files as import_files
     from hapticdb.machines.machine import Machine as Machine
+    from hapticdb.machines.machine_sweep import sweep_machine as sweep_machine
     from hapticdb.machines.reader import read_machine as read_machine
-    from hapticdb.machines.sweep import sweep_machine as sweep_machine
     from hapticdb.paper.cost_model import CostModel as CostModel
     from hapticdb.paper.quantiles import QuantileVector as QuantileVector
     from hapticdb.pointshell.shell import PointShell as PointShell

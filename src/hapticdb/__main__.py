@@ -13,7 +13,7 @@ def main() -> int:
     try:
         return run()
     except KeyboardInterrupt:  # after the verb
-        interrupting.tell()
+        interrupting.print_message()
         return interrupting.EXIT_CODE
     finally:
         interrupting.leave()

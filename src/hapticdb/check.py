@@ -10,11 +10,11 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.kept import pair_faults
+from hapticdb.clashes.pair_check import pair_faults
 from hapticdb.errors import DamagedError
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.ingest.geometry import unpacked_part
-from hapticdb.ingest.moving import rewrite_object
+from hapticdb.ingest.object_moves import rewrite_object
 from hapticdb.ingest.placement import OTHER_BOUNDS, placement_faults
 from hapticdb.kernels import curves
 from hapticdb.kernels.field import packing
@@ -52,7 +52,7 @@ class CheckReport:
     n_findings : number of all faults
     objects, voxels, rows, surfaces : numbers of objects, voxels, rows and surfaces read
     wrong : ids of objects with other rows, distances or bounds than written
-    strays : ids of rows or distances without an object
+    orphans : ids of rows or distances without an object
     pairs : rows of pairs that contradict their surfaces
     lacks_pairs : whether rows of pairs are missing
     """
@@ -65,7 +65,7 @@ class CheckReport:
     rows: int = 0
     surfaces: int = 0
     wrong: list[int] = field(default_factory=list)
-    strays: list[int] = field(default_factory=list)
+    orphans: list[int] = field(default_factory=list)
     pairs: list[PairRow] = field(default_factory=list)
     lacks_pairs: bool = False
 
@@ -81,7 +81,7 @@ class CheckReport:
     @property
     def is_mendable(self) -> bool:
         """Whether `repair_environment` can mend some of it."""
-        return bool(self.wrong or self.strays or self.pairs or self.lacks_pairs)
+        return bool(self.wrong or self.orphans or self.pairs or self.lacks_pairs)
 
     def add(self, finding: str) -> None:
         """Add a finding, unless the report has it already."""
@@ -129,13 +129,13 @@ def repair_environment(
     search for clashes; they stay accepted.
     """
     with closing(open_store(url)) as store:
-        total = len(report.wrong) + len(report.strays)
-        for n, object_id in enumerate(report.strays):
+        total = len(report.wrong) + len(report.orphans)
+        for n, object_id in enumerate(report.orphans):
             if isinstance(store, DropsRows):
                 store.drop_rows(object_id)
             if progress is not None:
                 progress(n + 1, total)
-        for n, object_id in enumerate(report.wrong, start=len(report.strays)):
+        for n, object_id in enumerate(report.wrong, start=len(report.orphans)):
             rewrite_object(store, store.object(object_id))
             if progress is not None:
                 progress(n + 1, total)
@@ -284,8 +284,8 @@ def _row_findings(
     report.voxels = sum(one.voxels for one in sums.of.values())
     if report.rows != total:
         yield f"{report.rows:,} rows were read, and {total:,} counted"
-    report.strays = sorted(sums.of.keys() - objects.keys())
-    for missing in report.strays:
+    report.orphans = sorted(sums.of.keys() - objects.keys())
+    for missing in report.orphans:
         yield f"rows of object {missing}, which is not there"
     for obj in objects.values():
         faults = list(_faults_of(obj, sums.of[obj.id]))

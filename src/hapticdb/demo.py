@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from hapticdb.clashes.groups import groups_of
 from hapticdb.clashes.rules import add_rules
-from hapticdb.clashes.run import WITHIN, find_clashes
+from hapticdb.clashes.search import WITHIN, find_clashes
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import GridError, UsageError
-from hapticdb.extraction.run import extract
+from hapticdb.extraction.removal_search import extract
 from hapticdb.extraction.verdict import extraction_line
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import ImportCallback, ImportOptions, import_files
@@ -80,11 +80,11 @@ class LayoutFigures:
     """Query figures of all strategies on one layout, pose by pose."""
 
     imported: Imported
-    felt: dict[Strategy, list[Query]]
+    queries: dict[Strategy, list[Query]]
 
     def median_us(self, strategy: Strategy) -> float:
         """Median time of a strategy's frames, microseconds."""
-        return float(np.median([query.elapsed_us for query in self.felt[strategy]]))
+        return float(np.median([query.elapsed_us for query in self.queries[strategy]]))
 
 
 @dataclass(frozen=True)
@@ -144,8 +144,8 @@ def answers(scene: DemoScene) -> Answers:
         groups = [one for one in groups_of(env.store, find_clashes(env).pairs) if one.is_open]
         apart = env.distance("body/hood", "body/windscreen")
         found = extract(env, "body/trunk_lid")
-        felt = env.touch(scene.shell, poses=scene.poses)
-    force = np.linalg.norm(felt.forces, axis=1)
+        queries = env.touch(scene.shell, poses=scene.poses)
+    force = np.linalg.norm(queries.forces, axis=1)
     clashes = (f"{one.title()}: {one.kind}, {one.length_text()}" for one in groups)
     lines = (
         ("what clashes?", "; ".join(clashes)),
@@ -153,8 +153,8 @@ def answers(scene: DemoScene) -> Answers:
         ("does it come out?", f"the trunk lid {extraction_line(found)}"),
         ("how does it feel?", f"a spanner pushed 1 mm into the car: up to {force.max():.3g} N"),
     )
-    lid = np.eye(4)[None] if found.way is None else found.way.poses
-    return Answers(lines, lid, force, felt.hits)
+    lid = np.eye(4)[None] if found.path is None else found.path.poses
+    return Answers(lines, lid, force, queries.hits)
 
 
 def _import(
@@ -199,19 +199,19 @@ def _race(
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
             env.touch(scene.shell, pose, strategy, law="plane")
-    felt: dict[Strategy, list[Query]] = {strategy: [] for strategy in COMPARED}
+    queries: dict[Strategy, list[Query]] = {strategy: [] for strategy in COMPARED}
     for index, pose in enumerate(scene.poses):
         # the first strategy at a pose brings its pages into the cache: they take turns at it
         turn = index % len(COMPARED)
         for strategy in COMPARED[turn:] + COMPARED[:turn]:
             touched = env.touch(scene.shell, pose, strategy, law="plane")
-            felt[strategy].append(touched.query)
+            queries[strategy].append(touched.query)
             found = _found(touched)
             if len(reference) == index:
                 reference.append(found)
             elif found != reference[index]:
                 disagreed.append(f"pose {index} by {strategy} on the {env.layout} layout")
-    return felt
+    return queries
 
 
 def _found(touched: Touch) -> tuple[bytes, bytes, bytes, tuple[int, ...]]:

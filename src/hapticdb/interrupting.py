@@ -52,7 +52,7 @@ def leave() -> None:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def tell() -> None:
+def print_message() -> None:
     """Write the one line, independent of the state of the program's streams."""
     os.write(2, MESSAGE)
 
@@ -61,7 +61,7 @@ def interrupt(_number: int, frame: FrameType | None) -> None:
     """Signal handler: raise KeyboardInterrupt or end the process, depending on the phase."""
     global _phase  # noqa: PLW0603
     if _phase == "starting":
-        tell()
+        print_message()
         os._exit(EXIT_CODE)
     if _phase == "leaving":
         _phase = "starting"  # a second Ctrl-C ends the process at once

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 import hapticdb
 from banded import move_points, write_points
 from hapticdb import DistanceField, Environment, Grid, TangentPlane
-from hapticdb.batches.feeler import Feeler
+from hapticdb.batches.batch_results import TouchBatch
+from hapticdb.batches.batch_tool import BatchTool
 from hapticdb.batches.on_gpu import GpuFrames
-from hapticdb.batches.result import TouchBatch
 from hapticdb.errors import UsageError
-from hapticdb.kernels import law as laws
-from hapticdb.kernels.field.law import DistanceFieldLaw
-from hapticdb.kernels.gpu import frames as kernels
+from hapticdb.kernels import force_law as laws
+from hapticdb.kernels.field.distance_law import DistanceFieldLaw
+from hapticdb.kernels.gpu import gpu_frames as kernels
 from hapticdb.resident import mirror
 from hapticdb.resident.table import LEAST_BUDGET
 from query import test_second_law as second
@@ -42,7 +42,7 @@ laws.define(CopiedLaw, laws.LEAVES[DistanceFieldLaw])
 
 
 class Copied:
-    """The same, as a feeler takes it."""
+    """The same, as a batch_tool takes it."""
 
     stiffness = 1000.0
     for_kernels = CopiedLaw(1000.0)
@@ -63,9 +63,9 @@ def sheets(folder: Path) -> Iterator[Environment]:
         yield env
 
 
-def gpu_of(feeler: Feeler) -> GpuFrames:
-    assert feeler._gpu is not None
-    return feeler._gpu
+def gpu_of(batch_tool: BatchTool) -> GpuFrames:
+    assert batch_tool._gpu is not None
+    return batch_tool._gpu
 
 
 def assert_near(found: TouchBatch, wanted: TouchBatch) -> None:
@@ -114,12 +114,12 @@ def a_frame_repeats_bit_for_bit(folder: Path) -> None:
     with sheets(folder) as env:
         poses = poses_in(env.grid, 4, beyond=-0.35)
         for n_points in (50, 150):
-            with env.feeler(cloud(n_points, extent=0.012), device="cuda") as feeler:
-                first, again = feeler.touch(poses), feeler.touch(poses[::-1])
+            with env.batch_tool(cloud(n_points, extent=0.012), device="cuda") as batch_tool:
+                first, again = batch_tool.touch(poses), batch_tool.touch(poses[::-1])
                 assert again.forces[::-1].tobytes() == first.forces.tobytes()
                 assert again.torques[::-1].tobytes() == first.torques.tobytes()
                 for n, pose in enumerate(poses):
-                    one = gpu_of(feeler).feel(pose)
+                    one = gpu_of(batch_tool).evaluate(pose)
                     assert one[:6].tolist() == [*first.forces[n], *first.torques[n]]
                     assert one[6:].tolist() == [
                         first.hits[n], first.n_contacts[n], 0.0, first.deepest[n]
@@ -129,8 +129,8 @@ def a_frame_repeats_bit_for_bit(folder: Path) -> None:
 def unknown_is_never_empty(folder: Path) -> None:
     with sheets(folder) as env:
         shell, poses = cloud(50, extent=0.012), poses_in(env.grid, 3, beyond=-0.35)
-        with env.feeler(shell, device="cuda") as feeler:
-            gpu = gpu_of(feeler)
+        with env.batch_tool(shell, device="cuda") as batch_tool:
+            gpu = gpu_of(batch_tool)
             ((_, found),) = gpu.run(poses)
             inside = [
                 env.grid.contains(
@@ -140,7 +140,7 @@ def unknown_is_never_empty(folder: Path) -> None:
             ]
             assert found.unknown.tolist() == inside
             assert not found.contacts.any()
-            feeler.touch(poses)
+            batch_tool.touch(poses)
             ((_, found),) = gpu.run(poses)
             assert found.contacts.any()
             assert not found.unknown.any()
@@ -149,19 +149,19 @@ def unknown_is_never_empty(folder: Path) -> None:
 def edits_arrive_by_the_slots_that_changed(folder: Path) -> None:
     with sheets(folder) as env:
         shell, poses = cloud(50, extent=0.012), poses_in(env.grid, 4, beyond=-0.35)
-        with env.feeler(shell, device="cuda") as feeler:
-            before = feeler.touch(poses)
-            n_copied = gpu_of(feeler).mirror.n_copied
-            feeler.touch(poses)
-            assert gpu_of(feeler).mirror.n_copied == n_copied
+        with env.batch_tool(shell, device="cuda") as batch_tool:
+            before = batch_tool.touch(poses)
+            n_copied = gpu_of(batch_tool).mirror.n_copied
+            batch_tool.touch(poses)
+            assert gpu_of(batch_tool).mirror.n_copied == n_copied
             with hapticdb.open(env.url) as other:
                 move_points(other.store, 1, sheet(12, 0, 22.3) - 14.0)  # in one cell
-            after = feeler.touch(poses)
+            after = batch_tool.touch(poses)
             assert after.revision > before.revision
             assert_near(after, env.touch(shell, poses=poses))
             assert (after.forces != before.forces).any()
             env.remove(2)
-            assert not feeler.touch(poses).n_contacts.any()
+            assert not batch_tool.touch(poses).n_contacts.any()
 
 
 def what_the_table_evicts_leaves_the_gpu(folder: Path) -> None:
@@ -172,9 +172,9 @@ def what_the_table_evicts_leaves_the_gpu(folder: Path) -> None:
         wanted = env.touch(shell, poses=poses)
         for most_listed in (0, mirror.MOST_LISTED):  # by a directory, and by a list of cells
             mirror.MOST_LISTED = most_listed
-            with env.feeler(shell, budget_bytes=LEAST_BUDGET, device="cuda") as feeler:
-                found = feeler.touch(poses)
-                assert feeler._residency.writer.n_evicted
+            with env.batch_tool(shell, budget_bytes=LEAST_BUDGET, device="cuda") as batch_tool:
+                found = batch_tool.touch(poses)
+                assert batch_tool._residency.writer.n_evicted
                 assert_near(found, wanted)
 
 
@@ -182,11 +182,11 @@ def a_pose_that_is_not_rigid_is_refused(folder: Path) -> None:
     with sheets(folder) as env:
         poses = poses_in(env.grid, 4)
         poses[2, 0, 0] = np.nan
-        with env.feeler(cloud(5), device="cuda") as feeler:
-            for ask in (feeler.touch, lambda some: gpu_of(feeler).feel(some[2])):
+        with env.batch_tool(cloud(5), device="cuda") as batch_tool:
+            for ask in (batch_tool.touch, lambda some: gpu_of(batch_tool).evaluate(some[2])):
                 with pytest.raises(UsageError, match="no rigid transform"):
                     ask(poses)
-            assert feeler.touch(poses[:2]).revision == env.store.revision()
+            assert batch_tool.touch(poses[:2]).revision == env.store.revision()
 
 
 CHECKS = (

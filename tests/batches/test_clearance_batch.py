@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import hapticdb
 from assemblies import box, write_obj
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
-from hapticdb.batches import exact, threads
+from hapticdb.batches import batch_threads, exact
 from hapticdb.errors import UsageError
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh import Part
@@ -87,11 +87,11 @@ def test_what_is_known_of_cubes_changes_no_distance(
         shell = PointShell(0.01 * line, np.tile([0.0, 0.0, 1.0], (n_points, 1)), np.zeros(3))
         poses = poses_in(env.grid, 12)
         expected = distances_by_hand(env, shell, poses, []).min(axis=1)
-        for n_cubes in (4, threads.CUBES):
-            monkeypatch.setattr(threads, "CUBES", n_cubes)
-            with env.feeler(shell, jobs=1, law="plane") as feeler:
+        for n_cubes in (4, batch_threads.CUBES):
+            monkeypatch.setattr(batch_threads, "CUBES", n_cubes)
+            with env.batch_tool(shell, jobs=1, law="plane") as batch_tool:
                 for reach in (9.0, 3.0, 9.0):
-                    found = feeler.clearance(poses, reach * SIZE).distances / SIZE
+                    found = batch_tool.clearance(poses, reach * SIZE).distances / SIZE
                     within = np.where(expected < reach, expected, np.inf)
                     assert found == pytest.approx(within, abs=ROUNDING)
 
@@ -100,7 +100,7 @@ def test_many_threads_and_little_memory_find_the_same_distances(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The cells within reach of all poses do not fit into the table together."""
-    monkeypatch.setattr(threads, "CHUNK_POSES", 3)
+    monkeypatch.setattr(batch_threads, "CHUNK_POSES", 3)
     with make(tmp_path, 8) as env:
         ijk = np.unique(np.random.default_rng(0).integers(0, 256, (3000, 3)), axis=0)
         write_voxels(env.store, ijk)
@@ -109,11 +109,13 @@ def test_many_threads_and_little_memory_find_the_same_distances(
         expected[expected >= 16.0] = np.inf
         for jobs in (1, 4):
             told: list[tuple[int, int]] = []
-            with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=jobs, law="plane") as feeler:
-                found = feeler.clearance(
+            with env.batch_tool(
+                shell, budget_bytes=LEAST_BUDGET, jobs=jobs, law="plane"
+            ) as batch_tool:
+                found = batch_tool.clearance(
                     poses, 16.0 * SIZE, progress=lambda *done, told=told: told.append(done)
                 )
-                assert feeler.n_loaded > 200
+                assert batch_tool.n_loaded > 200
             assert found.distances / SIZE == pytest.approx(expected, abs=ROUNDING)
             assert told[-1] == (40, 40)
 
@@ -142,10 +144,10 @@ def test_a_reach_that_is_none_is_refused(tmp_path: Path) -> None:
             with pytest.raises(UsageError, match="finite length above 0"):
                 env.clearance(cloud(5), poses, reach)
         with (
-            env.feeler(cloud(5), budget_bytes=LEAST_BUDGET) as feeler,
+            env.batch_tool(cloud(5), budget_bytes=LEAST_BUDGET) as batch_tool,
             pytest.raises(UsageError, match="more cells around a point"),
         ):
-            feeler.clearance(poses, 400 * SIZE)
+            batch_tool.clearance(poses, 400 * SIZE)
 
 
 def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def test_the_simulator_feels_as_the_processor(simulated: str, check: str) -> Non
 SEARCH = """
 import sys
 import hapticdb
-from hapticdb.kernels.gpu import nearest
+from hapticdb.kernels.gpu import gpu_nearest as nearest
 from session.worlds import SIZE, cloud, poses_in
 sys.setswitchinterval(1e-4)
 nearest.THREADS = 2
@@ -83,4 +83,4 @@ def test_no_gpu_or_unknown_device_is_told(
         env.touch(shell, poses=poses, device="cuda")
     assert len(env.touch(shell, poses=poses)) == 2
     with pytest.raises(UsageError, match="'tpu': choose 'cpu' or 'cuda'"):
-        env.feeler(cloud(5), device="tpu")  # type: ignore[arg-type]
+        env.batch_tool(cloud(5), device="tpu")  # type: ignore[arg-type]

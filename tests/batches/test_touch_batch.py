@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from banded import write_points
 from hapticdb import Environment, Grid, PointShell
 from hapticdb import create as create_environment
-from hapticdb.batches import threads
-from hapticdb.batches.result import TouchBatch
+from hapticdb.batches import batch_threads
+from hapticdb.batches.batch_results import TouchBatch
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.resident.table import LEAST_BUDGET
 from session.worlds import HIERARCHICAL, block, cloud, make, poses_in, scatter
@@ -64,15 +64,15 @@ def test_a_batch_equals_single_touches_under_the_law_distance(tmp_path: Path) ->
         assert felt.law.stiffness == 1000.0
         assert felt.n_contacts.any()
         assert_equals_touches(felt, env, shell, poses, [])
-        with env.feeler(shell) as feeler:  # hits are of voxels, whatever the law
-            assert feeler.collides(poses).tolist() == (felt.hits > 0).tolist()
+        with env.batch_tool(shell) as batch_tool:  # hits are of voxels, whatever the law
+            assert batch_tool.collides(poses).tolist() == (felt.hits > 0).tolist()
 
 
 def test_many_threads_and_little_memory_change_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """512 cells, nearly all with voxels, in a table with fewer slots; poses in random order."""
-    monkeypatch.setattr(threads, "CHUNK_POSES", 3)
+    monkeypatch.setattr(batch_threads, "CHUNK_POSES", 3)
     with make(tmp_path, 8) as env:
         rng = np.random.default_rng(0)
         write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
@@ -80,17 +80,17 @@ def test_many_threads_and_little_memory_change_nothing(
         plenty = env.touch(shell, poses=poses)
         told: list[tuple[int, int]] = []
         for jobs in (1, 4):
-            with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=jobs) as feeler:
-                assert feeler.size_bytes <= LEAST_BUDGET
+            with env.batch_tool(shell, budget_bytes=LEAST_BUDGET, jobs=jobs) as batch_tool:
+                assert batch_tool.size_bytes <= LEAST_BUDGET
                 told.clear()
-                scarce = feeler.touch(poses, progress=lambda *done: told.append(done))
-                assert feeler.n_loaded > 512  # cells left, and were read again
+                scarce = batch_tool.touch(poses, progress=lambda *done: told.append(done))
+                assert batch_tool.n_loaded > 512  # cells left, and were read again
             assert (scarce.forces + 0.0).tobytes() == (plenty.forces + 0.0).tobytes()
             assert (scarce.torques + 0.0).tobytes() == (plenty.torques + 0.0).tobytes()
             assert scarce.hits.tolist() == plenty.hits.tolist()
-            with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=jobs) as feeler:
-                assert feeler.collides(poses).tolist() == (plenty.hits > 0).tolist()
-                assert feeler.n_loaded > 512
+            with env.batch_tool(shell, budget_bytes=LEAST_BUDGET, jobs=jobs) as batch_tool:
+                assert batch_tool.collides(poses).tolist() == (plenty.hits > 0).tolist()
+                assert batch_tool.n_loaded > 512
             assert [total for _, total in told] == [300] * len(told)
             assert [done for done, _ in told] == sorted({done for done, _ in told})
             assert told[-1] == (300, 300)
@@ -152,9 +152,9 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
             env.touch(shell, poses=poses, exclude=["no such part"])
         for jobs in (0, -1, 1000):
             with pytest.raises(UsageError, match="jobs"):
-                env.feeler(shell, jobs=jobs)
+                env.batch_tool(shell, jobs=jobs)
         with pytest.raises(UsageError, match="budget"):
-            env.feeler(shell, budget_bytes=1000)
+            env.batch_tool(shell, budget_bytes=1000)
     with (
         make(tmp_path, 6, curve="lexicographic", layout="voxel") as plain,
         pytest.raises(UsageError, match="lexicographic"),

@@ -10,8 +10,8 @@ import trimesh
 import hapticdb
 from assemblies import row_of_boxes
 from hapticdb import Environment, accept_clash, find_clashes
+from hapticdb.clashes.clash_results import clash_of
 from hapticdb.clashes.groups import Group, groups_of
-from hapticdb.clashes.result import clash_of
 from servers import Place
 
 MM = 1e-3

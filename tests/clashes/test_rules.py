@@ -8,7 +8,7 @@ import pytest
 import hapticdb
 from assemblies import row_of_boxes
 from hapticdb import Environment, accept_clash, find_clashes
-from hapticdb.clashes.result import Clash, Clashes, rule_for
+from hapticdb.clashes.clash_results import Clash, Clashes, rule_for
 from hapticdb.clashes.rules import Rules, add_rules, parse_rule, read_rules, rule_text
 from hapticdb.errors import FileError, UsageError
 from hapticdb.store.base import Object

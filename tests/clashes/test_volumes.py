@@ -8,8 +8,8 @@ import trimesh
 
 import hapticdb
 from hapticdb import GridOptions, ImportOptions
-from hapticdb.clashes.result import Clashes
-from hapticdb.clashes.run import find_clashes
+from hapticdb.clashes.clash_results import Clashes
+from hapticdb.clashes.search import find_clashes
 from hapticdb.clashes.volumes import with_volumes
 from hapticdb.errors import MissingExtraError, UsageError
 

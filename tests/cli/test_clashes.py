@@ -18,7 +18,7 @@ import hapticdb
 from assemblies import ball, box, row_of_boxes, write_obj
 from command_line import Run, on_terminal, refused
 from hapticdb.pictures import reports
-from hapticdb.pictures.clashes import snapshot
+from hapticdb.pictures.clash_page import snapshot
 
 
 @pytest.fixture

@@ -32,12 +32,12 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
     out = succeeded(run("extract", lid(tmp_path, 0.0), "lid", "--motions", 0, "--json"))
     found = json.loads(out)
     assert list(found) == [
-        "line", "verdict", "parts", "to", "way", "near", "blockers", "pulls", "motions", "looks",
+        "line", "verdict", "parts", "to", "path", "near", "blockers", "pulls", "motions", "queries",
         "is_planned", "is_out_of_time", "elapsed", "seed",
     ]  # fmt: skip
-    assert set(found["way"]) == {"how", "poses", "length", "gap", "proof"}
-    assert (found["verdict"], found["way"]["how"]) == ("comes out", "pull")
-    (touched,) = found["way"]["proof"]["touching"]
+    assert set(found["path"]) == {"how", "poses", "length", "gap", "proof"}
+    assert (found["verdict"], found["path"]["how"]) == ("comes out", "pull")
+    (touched,) = found["path"]["proof"]["touching"]
     assert (touched["name"], touched["start"]) == ("pot", 5e-5)
     assert [obj["name"] for obj in found["near"]] == ["pot"]
 
@@ -63,7 +63,7 @@ def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
     assert row.split()[1] == "cage"
     assert not Path("out.csv").exists()
     found = json.loads(run("extract", url, "block", "--motions", 0, "--json")[1])
-    assert (found["way"], found["blockers"][0]["name"]) == (None, "cage")
+    assert (found["path"], found["blockers"][0]["name"]) == (None, "cage")
     to = ("--to", "0,0,500,1,0,0,0", "--motions", 0, "--json")
     found = json.loads(run("extract", url, "block", *to)[1])
     assert 1 < found["blockers"][0]["pulls"] <= found["pulls"]
@@ -97,8 +97,8 @@ def test_an_order_is_printed_and_each_step_is_written(run: Run, tmp_path: Path) 
     assert "off-1.csv ... off-2.csv" in out
     assert run("sweep", url, "--part", "weight", "--path", "off-1.csv")[0] == 0
     assert run("sweep", url, "--part", "lid", "--path", "off-2.csv")[0] == 1  # meets the weight
-    left_out = ("--exclude", "weight")
-    assert run("sweep", url, "--part", "lid", "--path", "off-2.csv", *left_out)[0] == 0
+    excluded = ("--exclude", "weight")
+    assert run("sweep", url, "--part", "lid", "--path", "off-2.csv", *excluded)[0] == 0
 
 
 def test_json_of_an_order_has_a_proof_a_step(run: Run, tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_json_of_an_order_has_a_proof_a_step(run: Run, tmp_path: Path) -> None:
         "line", "verdict", "parts", "steps", "failed", "is_out_of_time", "elapsed", "seed",
     ]  # fmt: skip
     assert [step["parts"][0]["name"] for step in found["steps"]] == ["weight", "lid"]
-    assert [step["way"]["proof"]["verdict"] for step in found["steps"]] == ["clear"] * 2
+    assert [step["path"]["proof"]["verdict"] for step in found["steps"]] == ["clear"] * 2
     assert [len(step["excluded"]) for step in found["steps"]] == [1, 2]
     assert found["failed"][0]["blockers"][0].keys() == {"id", "name", "pulls"}
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import PATIENCE, child, descendants, named, until
+from children import TIMEOUT, child, descendants, named, until
 from command_line import Run, command, on_terminal, refused, succeeded
-from hapticdb.cli.session_page import tell_cost
+from hapticdb.cli.session_report import note_cost
 from hapticdb.cli.values import size_of
 from hapticdb.errors import UsageError
 from hapticdb.query.law import LawName
@@ -107,7 +107,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
 def test_what_a_large_tool_costs_is_said_in_a_line(
     n_points: int, rate: float, law: LawName, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tell_cost(n_points, rate, law)
+    note_cost(n_points, rate, law)
     said = capsys.readouterr().err
     assert told in said
     assert len(said.splitlines()) == bool(told)
@@ -221,7 +221,7 @@ def test_a_database_that_is_gone_is_told_while_the_session_runs_and_at_its_end(
         assert process.stderr is not None
         line = process.stderr.readline()
         assert process.poll() is None
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=TIMEOUT)
     lost = json.loads(out)["database_lost"]
     assert (process.returncode, err) == (1, "")
     assert lost.startswith("scene.db cannot be reached any more ")
@@ -242,7 +242,7 @@ def test_a_session_whose_server_hangs_says_so_and_ends(scene: Path, tmp_path: Pa
             for member in family:
                 os.kill(member, signal.SIGSTOP)
             try:
-                out, err = process.communicate(timeout=PATIENCE)
+                out, err = process.communicate(timeout=TIMEOUT)
             finally:
                 for member in family:
                     os.kill(member, signal.SIGCONT)
@@ -264,7 +264,7 @@ def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Pat
         assert process.stderr is not None
         told = process.stderr.readline()
         process.send_signal(signal.SIGTERM)
-        out, _ = process.communicate(timeout=PATIENCE)
+        out, _ = process.communicate(timeout=TIMEOUT)
     report = json.loads(out)
     n_frames = len(recorded(path))
     assert report["recording_ended"] == (
@@ -310,7 +310,7 @@ def test_a_signal_ends_a_session_with_its_report(
         until(is_recording, every=0.05)
         started = descendants(process.pid)
         process.send_signal(number)
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=TIMEOUT)
     assert process.returncode == code
     assert re.fullmatch(rf"hapticdb: ended by {words} after [\d.]+ s\n", err)
     report = json.loads(out)
@@ -327,7 +327,7 @@ def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
         until(lambda: descendants(process.pid), every=0.002)
         started = descendants(process.pid)
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=TIMEOUT)
     assert process.returncode == 130
     if out:  # it was quicker than the signal
         assert "hapticdb: ended by Ctrl-C" in err
@@ -342,7 +342,7 @@ def test_sigterm_before_the_first_frame_leaves_nothing(scene: Path) -> None:
     with child(command(*args), cwd=scene.parent) as process:
         until(path.exists, every=0.002)
         process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=PATIENCE)
+        out, err = process.communicate(timeout=TIMEOUT)
     assert process.returncode == 143
     if out:  # it was quicker than the signal
         assert len(recorded(path))

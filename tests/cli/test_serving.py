@@ -9,7 +9,7 @@ from hapticdb.cli import main
 from hapticdb.cli.options import RenderingName
 from hapticdb.cli.verbs.serving import PageOptions, _tokens
 from hapticdb.server.access import Role
-from hapticdb.server.running import _page_request
+from hapticdb.server.lifecycle import _page_request
 from hapticdb.session.processes import fork_server
 
 

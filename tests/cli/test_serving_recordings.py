@@ -10,7 +10,7 @@ import pytest
 
 import hapticdb
 from banded import write_points
-from children import PATIENCE, child, until
+from children import TIMEOUT, child, until
 from hapticdb import Grid
 from hapticdb.recording.file import Recording
 from hapticdb.session.replay import replay
@@ -47,7 +47,7 @@ def test_sigterm_keeps_a_recording_that_is_under_way(
             server.send_signal(signal.SIGTERM)
             assert server.stderr is not None
             told = server.stderr.read()
-            assert server.wait(PATIENCE) == 128 + signal.SIGTERM
+            assert server.wait(TIMEOUT) == 128 + signal.SIGTERM
     assert "?token=" not in told
     assert "stopped" in told or verb == "view"
     (path,) = _recorded(folder)

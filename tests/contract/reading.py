@@ -125,8 +125,8 @@ class ReadingContract(StoreCase):
         for others, force in ((far_apart, 2.0), (many, 4.0), (many + 7, 4.0)):
             without = frame._replace(exclude=others)
             np.testing.assert_allclose(store.statement(without)[:3], [0, 0, force])
-            left_out = set(store.statement_hits(without)[1].tolist())
-            assert left_out == {1, 2} - set(others.tolist())
+            excluded = set(store.statement_hits(without)[1].tolist())
+            assert excluded == {1, 2} - set(others.tolist())
         nothing = frame._replace(exclude=np.array([1, 2], dtype=np.int64))
         assert not store.statement(nothing).any()
         assert not len(store.statement_hits(nothing)[0])

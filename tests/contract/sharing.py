@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from children import PATIENCE
+from children import TIMEOUT
 from contract.case import StoreCase
 from hapticdb.errors import DatabaseError, EnvironmentExistsError, ReadOnlyError, UsageError
 from hapticdb.ingest.layout import rows_of_voxels
@@ -33,7 +33,7 @@ class SharingContract(StoreCase):
             ThreadPoolExecutor(1) as thread,
             pytest.raises(UsageError, match="belongs to the thread that opened it"),
         ):
-            thread.submit(store.objects).result(PATIENCE)
+            thread.submit(store.objects).result(TIMEOUT)
         assert len(store.objects()) == 2
 
     def test_a_closed_store_says_so(self, store: Store) -> None:

@@ -76,7 +76,7 @@ def test_a_number_that_no_device_has_is_refused() -> None:
             replace(PROFILES["desktop"], **{field: value})
     for asked in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(UsageError, match=r"a stiffness of .* N/m: give 1 or more"):
-            stability.allow(PROFILES["omni"], 1000.0, asked)
+            stability.limit_stiffness(PROFILES["omni"], 1000.0, asked)
 
 
 # -- the rule -------------------------------------------------------------------------------------
@@ -93,25 +93,25 @@ def test_the_rule_is_that_of_its_source() -> None:
 
 def test_a_stiffness_that_is_too_great_is_lowered_with_one_line_that_says_by_what() -> None:
     desktop = PROFILES["desktop"]
-    found = stability.allow(desktop, 1000.0, 3000.0, 1e-3)
+    found = stability.limit_stiffness(desktop, 1000.0, 3000.0, 1e-3)
     assert found.stiffness == pytest.approx(0.4 * 0.6 * math.sqrt(4.5) / 1.5e-3)
     assert "3000 N/m lowered to 339.4 N/m: at 1 kHz and 1 ms" in str(found.lowered)
-    found = stability.allow(desktop, 10_000.0, 3000.0, 0.0)
+    found = stability.limit_stiffness(desktop, 10_000.0, 3000.0, 0.0)
     assert found.stiffness == 1000.0
     assert "the most that the profile desktop allows" in str(found.lowered)
-    assert "0.045 kg assumed" in str(stability.allow(PROFILES["omega"], 500.0).lowered)
+    assert "0.045 kg assumed" in str(stability.limit_stiffness(PROFILES["omega"], 500.0).lowered)
 
 
 def test_a_hand_that_no_force_moves_takes_any_stiffness() -> None:
-    assert stability.allow(SCRIPTED, 10.0).stiffness == 1000.0
-    assert stability.allow(SCRIPTED, 10.0, 1e5).stiffness == 1e5
+    assert stability.limit_stiffness(SCRIPTED, 10.0).stiffness == 1000.0
+    assert stability.limit_stiffness(SCRIPTED, 10.0, 1e5).stiffness == 1e5
 
 
 @given(profiles, RATES, DELAYS, st.floats(1.0, 1e5))
 def test_what_is_given_is_never_more_than_asked_rendered_or_stable(
     profile: DeviceProfile, rate: float, delay: float, asked: float
 ) -> None:
-    found = stability.allow(profile, rate, asked, delay)
+    found = stability.limit_stiffness(profile, rate, asked, delay)
     stable = 0.4 * (profile.own_damping + stability.hand_damping(profile)) / (0.5 / rate + delay)
     assert found.stiffness == max(min(asked, profile.stiffness, stable), stability.SMALLEST)
     assert (found.lowered is None) == (found.stiffness == asked)

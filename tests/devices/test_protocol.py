@@ -134,14 +134,14 @@ def test_a_reading_of_another_form_is_taken_as_it_is(change: Change) -> None:
     assert pose[:3, 3].tolist() == [0.0, 0.0, 0.015625]
     assert (velocity.dtype.str, velocity.tolist(), int(buttons)) == ("<f8", [0.0] * 6, 0)
     assert pose.flags.carray
-    assert reader.complaint() == ""
+    assert reader.fault() == ""
 
 
 @pytest.mark.parametrize(("change", "told"), MOMENTS)
 def test_a_reading_that_is_no_place_is_told(change: Change, told: str) -> None:
     reader = Reader(Odd(still(0.01), change))
     reader.read()
-    assert re.match(rf"Odd\.read\(\) returned {told}; expected ", reader.complaint())
+    assert re.match(rf"Odd\.read\(\) returned {told}; expected ", reader.fault())
 
 
 def test_a_simulated_device_goes_on_when_its_hand_is_somewhere_again() -> None:

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from children import PATIENCE, until
+from children import TIMEOUT, until
 from devices.fake_dhd import FakeDhd
 from devices.fake_dhd import install as install_dhd
 from devices.fake_haply import IDENTITY, FakeHaply, vector
@@ -34,7 +34,7 @@ def dhd(monkeypatch: pytest.MonkeyPatch) -> FakeDhd:
 
 @pytest.fixture
 def hd(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeHd]:
-    monkeypatch.setattr(openhaptics, "SILENCE", PATIENCE)  # a busy machine is no silent device
+    monkeypatch.setattr(openhaptics, "SILENCE", TIMEOUT)  # a busy machine is no silent device
     fake = install_hd(monkeypatch)
     yield fake
     fake.stop_scheduler()
@@ -42,7 +42,7 @@ def hd(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeHd]:
 
 @pytest.fixture
 def haply(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeHaply]:
-    monkeypatch.setattr(haply_module, "SILENCE", PATIENCE)
+    monkeypatch.setattr(haply_module, "SILENCE", TIMEOUT)
     with FakeHaply() as fake:
         yield fake
 
@@ -250,7 +250,7 @@ def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
     device = opened(OpenHapticsDevice(clock=lambda: now[0]))
     hd.unplug()
     device.read()
-    now[0] = PATIENCE + 0.1
+    now[0] = TIMEOUT + 0.1
     with pytest.raises(DeviceError, match="silent"):
         device.read()
     device.close()
@@ -278,7 +278,7 @@ def test_haply_is_told_forces_capped_and_nothing_else(haply: FakeHaply) -> None:
         device.apply(PUSH)
     device.read()
     device.close()
-    assert haply.is_over.wait(PATIENCE)
+    assert haply.is_over.wait(TIMEOUT)
     push = {"x": pytest.approx(4.2), "y": 0.0, "z": pytest.approx(5.6)}
     assert haply.forces == [vector(0, 0, 0), push, push, push, vector(0, 0, 0)]
     assert all(message["inverse3"][0]["device_id"] == "049D" for message in haply.told)

@@ -8,7 +8,7 @@ import pytest
 
 from contact_scenes import MM, Floats, frame_of, imported, judged, placed
 from hapticdb import find_clashes
-from hapticdb.exact.clash import judge
+from hapticdb.exact.clash import classify_pair
 from hapticdb.pointshell.shape import CollisionShape
 
 SIDES = ((0, 1, 2, 3), (7, 6, 5, 4), (4, 5, 1, 0), (5, 6, 2, 1), (6, 7, 3, 2), (7, 4, 0, 3))
@@ -52,7 +52,7 @@ def test_one_wedge_that_is_placed_many_times_touches_its_neighbour(n: int) -> No
         for pose, turn in ((before, i * angle), (after, (i + 1) * angle)):
             cos, sin = np.cos(turn), np.sin(turn)
             pose[:3, :3] = [[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]]
-        found = judge(wedge, wedge, np.linalg.inv(before) @ after, MM, 0.05 * MM)
+        found = classify_pair(wedge, wedge, np.linalg.inv(before) @ after, MM, 0.05 * MM)
         assert found.kind == "touching"
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from contact_scenes import MM, Triple, box, imported, pulls, shell_of, swept
 from hapticdb import Environment, PointShell
-from hapticdb.exact.clash import Judged, judge
-from hapticdb.exact.report import verdict_line
+from hapticdb.exact.clash import PairResult, classify_pair
+from hapticdb.exact.sweep_report import verdict_line
 from hapticdb.exact.swept import Swept
 from hapticdb.mesh import read_file
 from hapticdb.pointshell.shape import CollisionShape
@@ -69,12 +69,12 @@ def test_a_contact_is_free_with_less_reach(env: Environment) -> None:
     assert moving(env, BLUNT, little) == "not decided"
 
 
-def judged(gap: float) -> Judged:
+def judged(gap: float) -> PairResult:
     """Two blocks of 20 over one another."""
     blocks = [CollisionShape(MM * box((20.0,) * 3), chord=0.5 * MM * ERROR) for _ in range(2)]
     pose = np.eye(4)
     pose[:3, 3] = MM * np.array([1.0, 2.0, 20.0 + gap])
-    return judge(blocks[0], blocks[1], pose, MM, 0.05 * MM)
+    return classify_pair(blocks[0], blocks[1], pose, MM, 0.05 * MM)
 
 
 @pytest.mark.parametrize(

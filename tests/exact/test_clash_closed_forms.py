@@ -17,7 +17,7 @@ from contact_scenes import (
     placed,
     sheet,
 )
-from hapticdb.exact.clash import judge
+from hapticdb.exact.clash import classify_pair
 from hapticdb.pointshell.shape import CollisionShape
 
 FRAMES = (0, 1, 2)
@@ -67,7 +67,7 @@ def test_the_deepest_place_of_equal_shapes_is_in_both(seed: int) -> None:
     one, same = (CollisionShape(MM * box((100, 20, 20))) for _ in range(2))
     pose = frame_of(seed)
     pose[:3, 3] = MM * np.array([30.0, 8.0, 5.0])
-    found, apart = (judge(one, other, pose, MM, MM * CONTACT) for other in (one, same))
+    found, apart = (classify_pair(one, other, pose, MM, MM * CONTACT) for other in (one, same))
     assert found.kind == "overlapping"
     np.testing.assert_array_equal(found.on_a, apart.on_a)
     half = MM * np.array([50.0, 10.0, 10.0]) + 1e-9

@@ -11,9 +11,9 @@ from draws import drawn
 from hapticdb import PointShell
 from hapticdb.exact.distance import OverTimeError, Pair, error_of
 from hapticdb.exact.path import ToolPath
-from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
-from hapticdb.kernels.triangles.sweeping import MEETING
-from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH, triangle_bvh
+from hapticdb.kernels.triangles.path_distance import MEETING
+from hapticdb.pointshell.tool_surface import ToolSurface
 from moving_boxes import Boxes, distances, mesh
 from naive_motion import poses_at
 
@@ -34,16 +34,16 @@ def random_boxes(rng: np.random.Generator, spread: float) -> Boxes:
     return Boxes(pose[None], 0.01 * rng.permutation(kind)[None] * rng.uniform(0.6, 1.5))
 
 
-def tree_of(boxes: Boxes) -> TriangleTree:
+def bvh_of(boxes: Boxes) -> TriangleBVH:
     triangles = np.array(mesh(boxes.halves[0]).triangles)
     pose = boxes.poses[0]
     triangles = triangles @ pose[:3, :3].T + pose[:3, 3]
-    return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))
+    return triangle_bvh(triangles, np.zeros(len(triangles), dtype=np.int64))
 
 
-def tool_of(boxes: Boxes) -> MovingSurface:
+def tool_of(boxes: Boxes) -> ToolSurface:
     made = mesh(boxes.halves[0])
-    return MovingSurface(PointShell.from_mesh(made.vertices, made.faces, 10))
+    return ToolSurface(PointShell.from_mesh(made.vertices, made.faces, 10))
 
 
 def random_path(rng: np.random.Generator) -> Floats:
@@ -64,19 +64,19 @@ def check_a_path(rng: np.random.Generator) -> str:
     still, tool = random_boxes(rng, 0.05), random_boxes(rng, 0.0)._replace(poses=np.eye(4)[None])
     poses, center = random_path(rng), rng.uniform(-0.02, 0.02, 3)
     way = ToolPath.of(poses, tool.corners()[0], center)
-    pair = Pair(tree_of(still), tool_of(tool), way)
+    pair = Pair(bvh_of(still), tool_of(tool), way)
     found, closed = pair.least(0.0, np.inf)
     assert found is not None
     times = np.linspace(0.0, len(poses) - 1.0, PLACES)
     placed = Boxes(poses_at(poses, center, times), np.repeat(tool.halves, PLACES, axis=0))
     others = Boxes(np.repeat(still.poses, PLACES, axis=0), np.repeat(still.halves, PLACES, axis=0))
     exact, _ = distances(others, placed)
-    here = Boxes(way.at([found.way]), tool.halves)
+    here = Boxes(way.at([found.parameter]), tool.halves)
     at_place = float(distances(still, here)[0][0])
     assert at_place == pytest.approx(found.at_most, abs=1e-9)
     if found.at_most <= MEETING:
-        if found.way > MEETING:
-            before = way.at(np.linspace(0.0, found.way - MEETING, PLACES))
+        if found.parameter > MEETING:
+            before = way.at(np.linspace(0.0, found.parameter - MEETING, PLACES))
             earlier = distances(others, Boxes(before, placed.halves))[0]
             assert earlier.min() >= 0.5 * MEETING - 1e-9
         return "hits"
@@ -104,7 +104,7 @@ def test_a_box_slides_along_another_at_its_gap(gap: float) -> None:
     tool = Boxes(np.eye(4)[None], np.array([[0.02, 0.02, 0.02]]))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[-0.2, 0.0, 0.04 + gap], [0.2, 0.01, 0.04 + gap]]
-    pair = Pair(tree_of(still), tool_of(tool), ToolPath.of(poses, tool.corners()[0], np.zeros(3)))
+    pair = Pair(bvh_of(still), tool_of(tool), ToolPath.of(poses, tool.corners()[0], np.zeros(3)))
     found, closed = pair.least(0.0, np.inf)
     assert found is not None
     assert found.at_most == pytest.approx(gap, rel=1e-9)
@@ -116,7 +116,7 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[0.3, 0.0, 0.0], [0.15, 0.02, 0.0]]
     way = ToolPath.of(poses, np.array([[-0.03] * 3, [0.03] * 3]), np.zeros(3))
-    pair = Pair(tree_of(still), MovingSurface(PointShell.sphere(0.03)), way)
+    pair = Pair(bvh_of(still), ToolSurface(PointShell.sphere(0.03)), way)
     found, _ = pair.least(0.0, np.inf)
     assert found is not None
     assert found.at_most == pytest.approx(0.02, rel=0.01)
@@ -127,6 +127,6 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
 def test_a_limit_of_time_ends_the_search() -> None:
     still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
     way = ToolPath.of(np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 3)), np.zeros(3))
-    pair = Pair(tree_of(still), tool_of(still), way, time.monotonic() - 1.0)
+    pair = Pair(bvh_of(still), tool_of(still), way, time.monotonic() - 1.0)
     with pytest.raises(OverTimeError):
         pair.least(0.0, np.inf)

@@ -62,12 +62,12 @@ def test_poses_on_the_way_are_those_of_plain_formulas(
     center = middle_of(corners)
     poses = path_poses(moved, seed, center)
     path = ToolPath.of(poses, corners, center)
-    for m, length in enumerate(np.diff(path.ways).tolist()):
+    for m, length in enumerate(np.diff(path.parameters).tolist()):
         if not length:
             continue
-        ways = path.ways[m] + length * np.array(shares)
+        ways = path.parameters[m] + length * np.array(shares)
         found = path.at(ways)
-        expected = poses_at(poses, center, m + (ways - path.ways[m]) / length)
+        expected = poses_at(poses, center, m + (ways - path.parameters[m]) / length)
         nearly_pi = moved[m][2] > np.pi - 1e-6  # either way round is a smallest turn
         if not nearly_pi:
             assert np.allclose(found, expected, atol=1e-8)

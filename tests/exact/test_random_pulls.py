@@ -30,7 +30,7 @@ SOME, ALL, AT_ONCE = 50, 1000, 50
 FREE = {"clear", "slides", "overlaps"}
 SLACK = 0.002
 """Rounding, and the search's tolerance where it meets a surface."""
-LOOKS = np.linspace(0.0, 1.0, 7)
+MOST_QUERIES = np.linspace(0.0, 1.0, 7)
 """Fractions of a free path at which the surfaces are compared."""
 MET = 0.0105
 """Greatest distance at which surfaces count as met."""
@@ -75,7 +75,7 @@ def swept_case(env: Environment, seed: int) -> Case:
     return Case(seed, pull, swept(env, tool, poses, names, seated=pull.seated))
 
 
-def complaint(case: Case) -> str:
+def fault(case: Case) -> str:
     """What is wrong with what a sweep has found; empty if nothing is."""
     verdict, truth = str(case.found.verdict), case.pull.truth
     if verdict == "not decided":
@@ -132,7 +132,7 @@ def surfaces_of(case: Case, body: Body) -> tuple[Surface, Surface]:
 def against_winding(case: Case, body: Body, reach: float) -> str:
     """No place is deeper in a closed body, and no edge through more of a surface, than `reach`."""
     tool, thing = surfaces_of(case, body)
-    for n, step in enumerate(case.steps(*LOOKS)):
+    for n, step in enumerate(case.steps(*MOST_QUERIES)):
         back = np.linalg.inv(step)
         deep = max(
             thing.depth_of(placed(tool.samples, step)), tool.depth_of(placed(thing.samples, back))
@@ -194,7 +194,7 @@ def checked(folder: Path, seeds: list[int]) -> list[Case]:
         with imported(folder / f"{first}.db", objects) as env:
             found = [swept_case(env, seed) for seed in some]
         cases += found
-        wrong += [(one.seed, one.found.verdict, told) for one in found if (told := complaint(one))]
+        wrong += [(one.seed, one.found.verdict, told) for one in found if (told := fault(one))]
     assert wrong == [], "\n".join(map(str, wrong))
     return cases
 

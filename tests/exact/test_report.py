@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hapticdb import PointShell
-from hapticdb.exact.report import gap_text, verdict_line
+from hapticdb.exact.sweep_report import gap_text, verdict_line
 from hapticdb.exact.swept import Gap, Swept
 from made_sweeps import CORNERS, line, place_at, swept, thing, touching
 

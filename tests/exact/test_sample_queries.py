@@ -14,15 +14,15 @@ from scipy.optimize import lsq_linear
 
 from hapticdb.exact.distance import Pair
 from hapticdb.exact.path import ToolPath
-from hapticdb.kernels.surfaces.sides import triangle_tree
-from hapticdb.kernels.triangles.sweeping import MEETING
-from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.kernels.surfaces.triangle_bvh import triangle_bvh
+from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.pointshell.shape import CollisionShape
+from hapticdb.pointshell.tool_surface import ToolSurface
 
 Floats = NDArray[np.float64]
 
 
-class Primitive(MovingSurface):
+class Primitive(ToolSurface):
     """A triangle (3, 3); of an edge or a vertex, with corners that coincide."""
 
     def __init__(self, corners: Floats) -> None:
@@ -59,7 +59,7 @@ def test_no_collision_of_the_sample_queries_is_missed(real_files: Path) -> None:
         is_edges, is_hit = row["kind"] == "edge-edge", row["hit"] == "1"
         moving, still = (p[[0, 1, 1]], p[[2, 3, 3]]) if is_edges else (p[[0, 0, 0]], p[1:])
         way = ToolPath.of(poses, moving, moving.mean(axis=0))
-        tree = triangle_tree(still[None], np.zeros(1, dtype=np.int64))
+        tree = triangle_bvh(still[None], np.zeros(1, dtype=np.int64))
         found, closed = Pair(tree, Primitive(moving), way).least(0.0, np.inf)
         assert found is not None
         is_told, true = found.at_most <= MEETING, least(is_edges, p, np.array(shift))

@@ -17,7 +17,7 @@ from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.exact.separation import CONTACT
 from hapticdb.exact.sweep import sweep
 from hapticdb.exact.swept import Swept
-from hapticdb.kernels.triangles.sweeping import MEETING
+from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]

@@ -36,7 +36,7 @@ SCENES = {pull.name: pull for pull in PULLS}
 SEATED = [pull.name for pull in PULLS if pull.name != "buried tool"]
 """What stands deep in a plate is freed or not by its box, which a frame changes."""
 FREE = {"clear", "slides"}
-LOOK = 0.03
+GPU_QUERY = 0.03
 """Millimetres of the path by which a hit may be told later than it is met."""
 
 
@@ -87,7 +87,7 @@ def test_a_seated_part_is_free_overlaps_or_hits(env: Environment, name: str, see
             assert one.start_at_least <= one.start * (1.0 + 1e-6)
             assert one.start / MM <= max(pull.start, REACH + pull.contact - CONTACT)
     if pull.expected == "hits":
-        assert pull.after <= first_hit(found) <= pull.by + LOOK
+        assert pull.after <= first_hit(found) <= pull.by + GPU_QUERY
 
 
 @pytest.mark.parametrize("seed", FRAMES)
@@ -207,7 +207,7 @@ def test_extract_finds_no_way_out_of_a_closed_tin(tmp_path_factory: pytest.TempP
     folder = tmp_path_factory.mktemp("tin")
     with imported(folder / "tin.db", {"tin": TIN, "label": LABEL}) as env:
         found = hapticdb.extract(env, "label", seconds=5.0, motions=100)
-    assert found.way is None or not found.is_free
+    assert found.path is None or not found.is_free
     assert found.verdict != "comes out"
 
 

@@ -29,7 +29,7 @@ def assert_free(scene: Scene, found: Disassembly, gone: tuple[str, ...] = ()) ->
     ids = {name: n for n, name in enumerate(sorted(scene))}
     assert len(ids) == len(scene)
     for step in found.steps:
-        way, (part,) = step.found.way, step.found.parts
+        way, (part,) = step.found.path, step.found.parts
         assert way is not None
         assert step.found.verdict == "comes out"
         assert np.allclose(way.poses[:, :3, :3], np.eye(3))

@@ -43,21 +43,21 @@ from hapticdb.extraction.verdict import extraction_line
 def test_a_lid_above_its_pot_lifts_off_with_its_gap(tmp_path: Path) -> None:
     url = lid(tmp_path, 0.03)
     found = found_in(url, "lid", motions=0)
-    assert found.way is not None
-    assert (found.verdict, found.way.how, found.near) == ("comes out", "pull", ())
+    assert found.path is not None
+    assert (found.verdict, found.path.how, found.near) == ("comes out", "pull", ())
     assert is_out(found, url)
-    assert found.way.gap == pytest.approx(0.03, rel=0.01)
+    assert found.path.gap == pytest.approx(0.03, rel=0.01)
     assert extraction_line(found).startswith("comes out straight, ")
 
 
 def test_a_lid_on_its_pot_comes_out_though_it_touches_it(tmp_path: Path) -> None:
     url = lid(tmp_path, 0.0)
     found = found_in(url, "lid", motions=0)
-    assert found.way is not None
+    assert found.path is not None
     assert found.verdict == "comes out"
     assert [obj.name for obj in found.near] == ["pot"]
-    assert [one.object.name for one in found.way.swept.touching] == ["pot"]
-    assert found.way.poses[-1][2, 3] >= 0.0  # not through the pot
+    assert [one.object.name for one in found.path.swept.touching] == ["pot"]
+    assert found.path.poses[-1][2, 3] >= 0.0  # not through the pot
     assert is_out(found, url)
     assert "; touches pot until " in extraction_line(found)
 
@@ -75,23 +75,23 @@ def test_a_bolt_comes_out_of_a_bore_a_twentieth_of_a_voxel_wider(
 ) -> None:
     """By voxels it is in contact all around; tilted, no axis of the world is its own."""
     found = found_in(recessed(tmp_path, tilt), "bolt", motions=0)
-    assert found.way is not None
-    assert (found.verdict, found.way.how) == ("comes out", "pull")
-    way = found.way.poses[-1][:3, 3]
+    assert found.path is not None
+    assert (found.verdict, found.path.how) == ("comes out", "pull")
+    way = found.path.poses[-1][:3, 3]
     assert way @ [np.sin(tilt), 0.0, np.cos(tilt)] == pytest.approx(np.linalg.norm(way))
-    assert found.way.swept.verdict == "clear"
+    assert found.path.swept.verdict == "clear"
 
 
 def test_a_nut_leaves_its_bolt_by_a_screw_motion_only(tmp_path: Path) -> None:
     url = threaded(tmp_path)
-    assert found_in(url, "nut", motions=0).way is None
+    assert found_in(url, "nut", motions=0).path is None
     found = found_in(url, "nut", motions=0, screw=PITCH)
-    assert found.way is not None
-    assert (found.verdict, found.way.how) == ("comes out", "screw")
-    assert found.way.gap is not None
-    assert 0.0005 < found.way.gap < 0.002
+    assert found.path is not None
+    assert (found.verdict, found.path.how) == ("comes out", "screw")
+    assert found.path.gap is not None
+    assert 0.0005 < found.path.gap < 0.002
     assert extraction_line(found).startswith("comes out by a screw motion, ")
-    assert found_in(url, "nut", motions=0, screw=2.0 * PITCH).way is None
+    assert found_in(url, "nut", motions=0, screw=2.0 * PITCH).path is None
 
 
 def test_open_surfaces_come_out_of_contact_too(tmp_path: Path) -> None:
@@ -101,17 +101,17 @@ def test_open_surfaces_come_out_of_contact_too(tmp_path: Path) -> None:
     cap = box((-0.02, -0.02, 0.1), (0.22, 0.22, 0.12))
     cap.update_faces(np.arange(len(cap.faces)) > 1)
     found = found_in(imported(tmp_path, 0.01, pot=open_pot, lid=cap), "lid", motions=0)
-    assert found.way is not None
+    assert found.path is not None
     assert found.verdict == "comes out"
-    assert [one.object.name for one in found.way.swept.touching] == ["pot"]
+    assert [one.object.name for one in found.path.swept.touching] == ["pot"]
 
 
 def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:
     url = drawer(tmp_path)
     found = found_in(url, "drawer", motions=0)
-    assert found.way is not None
-    assert (found.verdict, found.way.how) == ("comes out", "pull")
-    way = found.way.poses[-1][:3, 3]
+    assert found.path is not None
+    assert (found.verdict, found.path.how) == ("comes out", "pull")
+    way = found.path.poses[-1][:3, 3]
     assert way[1] > 0.9 * np.linalg.norm(way)
     assert is_out(found, url)
     assert [(one.object.name, one.pulls > 0) for one in found.blockers] == [("shaft", True)]
@@ -121,11 +121,11 @@ def test_a_block_leaves_a_room_by_its_door_without_a_planner(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By straight legs along the axes."""
-    monkeypatch.delattr(Planner, "_ask")
+    monkeypatch.delattr(Planner, "_plan")
     found = found_in(room_with_a_door(tmp_path), "block")
     assert (found.verdict, found.is_planned) == ("comes out", True)
-    assert found.way is not None
-    up, along, out = np.diff(found.way.poses[:, :3, 3], axis=0)
+    assert found.path is not None
+    up, along, out = np.diff(found.path.poses[:, :3, 3], axis=0)
     assert up[2] > 0.02
     assert (along != 0.0).tolist() == [True, False, False]
     assert 0.27 < up[0] + along[0] < 0.37  # the block is 0.06 m wide, the door 0.14 m
@@ -138,10 +138,10 @@ def test_a_block_leaves_a_room_by_its_door_without_a_planner(
 def test_a_way_round_a_corner_is_planned_and_proved(tmp_path: Path) -> None:
     url = corner(tmp_path)
     found = found_in(url, "block", seed=3)
-    assert found.way is not None
-    assert (found.verdict, found.way.how) == ("comes out", "plan")
+    assert found.path is not None
+    assert (found.verdict, found.path.how) == ("comes out", "plan")
     assert is_out(found, url)
-    assert len(found.way.poses) > 2
+    assert len(found.path.poses) > 2
     assert [one.object.name for one in found.blockers] == ["channel"]
     assert f"<td>channel</td><td>stops {found.pulls} pulls</td>" in found._repr_html_()
     assert found.blockers[0].pulls == found.pulls  # none leads out straight
@@ -151,17 +151,17 @@ def test_a_way_round_a_corner_is_planned_and_proved(tmp_path: Path) -> None:
 def test_the_same_seed_gives_the_same_path(tmp_path: Path) -> None:
     url = corner(tmp_path)
     found = found_in(url, "block", seed=3)
-    assert found.way is not None
+    assert found.path is not None
     again = found_in(url, "block", seed=3)
-    assert again.way is not None
-    assert np.array_equal(found.way.poses, again.way.poses)
+    assert again.path is not None
+    assert np.array_equal(found.path.poses, again.path.poses)
     assert again.motions == found.motions
 
 
 @pytest.mark.parametrize("to", [None, shifted(np.array([0.2, 0.0, 0.0]))])
 def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path, to: Any) -> None:  # noqa: ANN401
     found = found_in(enclosed(tmp_path), "block", motions=60, to=to)
-    assert (found.verdict, found.way, found.is_planned) == ("no way found", None, True)
+    assert (found.verdict, found.path, found.is_planned) == ("no way found", None, True)
     assert [one.object.name for one in found.blockers] == ["cage"]
     assert found.blockers[0].pulls == found.pulls + (to is not None)  # and the straight way there
     assert "cage blocks" in extraction_line(found)
@@ -171,7 +171,7 @@ def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path, to: A
 def test_the_time_ends_the_planner(tmp_path: Path) -> None:
     """Without its end, ten million motions would take hours."""
     found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=1.0)
-    assert found.way is None
+    assert found.path is None
     assert (found.verdict, found.verdict.exit_status) == ("not decided", 3)
     assert extraction_line(found).startswith("not decided: the time was over; no way found in")
     assert "give more --seconds" in extraction_line(found)
@@ -185,8 +185,8 @@ def test_its_sweeps_end_with_the_search(tmp_path: Path, monkeypatch: pytest.Monk
         now[0] += max(seconds, 1.0)
         return sweep(*args, seconds=1e-9, **options)
 
-    monkeypatch.setattr("hapticdb.extraction.judge.sweep", slow)
-    for module in ("judge", "pulls", "run"):
+    monkeypatch.setattr("hapticdb.extraction.proof.sweep", slow)
+    for module in ("proof", "pulls", "removal_search"):
         clock = SimpleNamespace(monotonic=lambda: now[0])
         monkeypatch.setattr(f"hapticdb.extraction.{module}.time", clock)
     found = found_in(lid(tmp_path, 0.03), "lid", motions=0, seconds=10.0)
@@ -219,9 +219,9 @@ def test_a_pose_is_reached_straight_where_nothing_is_in_the_way(tmp_path: Path) 
     goal = trimesh.transformations.rotation_matrix(0.3, [0.0, 0.0, 1.0])
     goal[2, 3] = 0.05
     found = found_in(lid(tmp_path, 0.03), "lid", to=goal)
-    assert found.way is not None
-    assert (found.verdict, found.way.how, found.is_planned) == ("comes out", "pull", False)
-    assert np.array_equal(found.way.poses, [np.eye(4), goal])
+    assert found.path is not None
+    assert (found.verdict, found.path.how, found.is_planned) == ("comes out", "pull", False)
+    assert np.array_equal(found.path.poses, [np.eye(4), goal])
     assert extraction_line(found).startswith("reaches the pose straight, ")
 
 
@@ -229,9 +229,9 @@ def test_a_pose_round_a_corner_is_reached_by_a_plan(tmp_path: Path) -> None:
     """In the channel's arm along x, where no straight pull leads."""
     goal = shifted(np.array([0.15, 0.0, 0.265]))
     found = found_in(corner(tmp_path), "block", to=goal)
-    assert found.way is not None
-    assert (found.verdict, found.way.how) == ("comes out", "plan")
-    assert np.allclose(found.way.poses[-1], goal, atol=1e-12)
+    assert found.path is not None
+    assert (found.verdict, found.path.how) == ("comes out", "plan")
+    assert np.allclose(found.path.poses[-1], goal, atol=1e-12)
 
 
 def test_a_bolt_goes_into_its_bore(tmp_path: Path) -> None:
@@ -241,9 +241,9 @@ def test_a_bolt_goes_into_its_bore(tmp_path: Path) -> None:
         aside = shifted(np.array([0.06, 0.0, 0.03]))
         env.move(bolt.id, aside @ bolt.transform)
         found = extract(env, "bolt", to=np.linalg.inv(aside), seconds=500.0)
-    assert found.way is not None
-    assert (found.verdict, found.way.how) == ("comes out", "plan")
-    assert np.allclose(found.way.poses[-1], np.linalg.inv(aside), atol=1e-12)
+    assert found.path is not None
+    assert (found.verdict, found.path.how) == ("comes out", "plan")
+    assert np.allclose(found.path.poses[-1], np.linalg.inv(aside), atol=1e-12)
 
 
 # --- wrong arguments -----------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def test_a_child_is_killed_with_its_group_when_its_time_is_over() -> None:
     pids: list[int] = []
 
     def listen() -> None:
-        with child(["sh", "-c", "sleep 600 & echo $!; wait"], patience=0.5) as process:
+        with child(["sh", "-c", "sleep 600 & echo $!; wait"], timeout=0.5) as process:
             assert process.stdout is not None
             pids.extend(map(int, process.stdout))  # reads until the pipe closes
 

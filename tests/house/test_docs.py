@@ -44,10 +44,10 @@ def test_every_block_of_the_pages_runs(tmp_path: Path, pages: tuple[str, ...]) -
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     script = "\n".join(block for page in pages for block in blocks("sh", page))
     bash = ["bash", "-euo", "pipefail", "-c", script]
-    done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
+    done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, timeout=LONG)
     assert done.returncode == 0, done.stderr
     session = "\n".join(block for page in pages for block in blocks("python", page))
-    done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
+    done = finished([sys.executable, "-c", session], cwd=tmp_path, timeout=LONG)
     assert done.returncode == 0, done.stderr
 
 
@@ -65,7 +65,7 @@ def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binar
         found = ""
         for block in ["createdb plant", *blocks("sh", "docs/postgresql.md")]:
             bash = ["bash", "-euo", "pipefail", "-c", block]
-            done = finished(bash, cwd=tmp_path, env=os.environ | variables, patience=LONG)
+            done = finished(bash, cwd=tmp_path, env=os.environ | variables, timeout=LONG)
             assert done.returncode == 0, done.stderr
             found = done.stdout
     assert "postgresql:///plant and postgresql:///restored hold the same" in found

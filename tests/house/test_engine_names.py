@@ -13,7 +13,7 @@ ASKS_OF_TEXT = {"startswith", "endswith", "partition", "removeprefix", "match", 
 
 def test_only_the_stores_know_their_engine() -> None:
     """No other module imports an engine's driver or modules, or branches on an engine's name."""
-    folders = {f"hapticdb.store.{path.parent.name}" for path in PACKAGE.glob("store/*/store.py")}
+    folders = {f"hapticdb.store.{path.parent.name}" for path in PACKAGE.glob("store/*/*_store.py")}
     assert len(folders) == 2
     for path in modules():
         if path.is_relative_to(PACKAGE / "store"):

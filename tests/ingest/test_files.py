@@ -35,8 +35,8 @@ from hapticdb.kernels.surfaces.voxelize import brick_voxels, voxelize
 from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
 from hapticdb.store import base
 from hapticdb.store.base import Layout, Object
-from hapticdb.store.refusals import present_already
 from hapticdb.store.sqlite.tables.file_tables import FileTables
+from hapticdb.store.store_errors import present_already
 from mesh_files import gltf
 from naive import Voxel, voxels_of_points
 from voxels import KINDS

@@ -13,7 +13,7 @@ import pytest
 
 import hapticdb
 from assemblies import Mesh, Rows, ball, left_behind, rows_of, small_options, write_obj
-from children import PATIENCE, child, until
+from children import TIMEOUT, child, until
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.resident.table import is_alive
@@ -97,7 +97,7 @@ def test_an_import_killed_before_its_first_object_leaves_nothing_or_an_empty_dat
         if is_there:
             until(lambda: left_behind(tmp_path), every=0.0005)
         process.kill()
-        process.wait(PATIENCE)
+        process.wait(TIMEOUT)
     if database.exists():
         assert len(rows_of(database, "object")["object"]) <= 3
     assert_finishes(database, folder / "balls.obj", undisturbed)
@@ -111,7 +111,7 @@ def test_an_interrupted_import_run_again_ends_as_an_undisturbed_one(
     with importing(database, folder / "balls.obj") as process:
         wait_for(process, 7)
         process.send_signal(signal.SIGINT)
-        _, words = process.communicate(timeout=PATIENCE)
+        _, words = process.communicate(timeout=TIMEOUT)
         assert process.returncode == -signal.SIGINT
     assert words.strip().endswith("KeyboardInterrupt")
     assert left_behind(tmp_path) == ["e.db"]
@@ -125,7 +125,7 @@ def test_an_import_interrupted_while_it_reads_leaves_nothing(folder: Path, tmp_p
         wait_for(process, 0)
         parser = wait_for_parser(process.pid)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=PATIENCE)
+        process.communicate(timeout=TIMEOUT)
         assert process.returncode == -signal.SIGINT
     assert left_behind(tmp_path) == []
     until(lambda: not is_alive(parser))
@@ -167,7 +167,7 @@ def test_an_import_ends_at_a_signal_in_the_middle_of_a_part(
         assert process.stdout is not None
         assert process.stdout.readline() == "begun\n"
         process.send_signal(number)
-        _, told = process.communicate(timeout=PATIENCE)
+        _, told = process.communicate(timeout=TIMEOUT)
     assert process.returncode == code
     assert told.count("\n") == bool(words)
     assert told.startswith(words)

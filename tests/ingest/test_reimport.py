@@ -40,13 +40,13 @@ def test_what_was_removed_stays_so_when_asked(run: Run, scene: Path, file: Path)
     out = succeeded(run(*keep))
     assert "complete already (1 object), nothing to do; 2 removed parts left out" in out
     found = json.loads(run(*keep, "--json")[1])
-    assert (found["present"], found["restored"], found["kept_removed"]) == (1, 0, 2)
+    assert (found["present"], found["restored"], found["still_removed"]) == (1, 0, 2)
     assert names(scene) == ["box1"]
     with hapticdb.open(scene) as env:
         report = env.add(file, keep_removed=True)
-        assert (report.added, report.kept_removed) == ((), 2)
+        assert (report.added, report.still_removed) == ((), 2)
         report = env.add(file)
-        assert (len(report.added), report.restored, report.kept_removed) == (2, 2, 0)
+        assert (len(report.added), report.restored, report.still_removed) == (2, 2, 0)
 
 
 def test_what_was_never_there_is_not_held_for_removed(run: Run, tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_what_was_never_there_is_not_held_for_removed(run: Run, tmp_path: Path) 
     assert names(tmp_path / "a.db") == ["box1", "box2", "box3"]
     other = boxes(tmp_path / "other.glb", 1)
     found = json.loads(run("import", "a.db", other, "--keep-removed", "--json")[1])
-    assert (found["objects"], found["kept_removed"]) == (1, 0)
+    assert (found["objects"], found["still_removed"]) == (1, 0)
 
 
 def changed_file(folder: Path) -> Path:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from hapticdb import Grid
 from hapticdb.kernels.resident import cell_table as kernels
-from hapticdb.kernels.resident.cells import Place, cell_key, spread_key
+from hapticdb.kernels.resident.cells import CellGrid, cell_key, spread_key
 from session.worlds import poses_in
 
 CAPACITY = 16
@@ -66,8 +66,11 @@ def test_cells_met_within_reach_are_those_of_the_boxes_around_the_points(
             sides = [range(a // 32, b // 32 + 1) for a, b in zip(low, high, strict=True)]
             expected |= {int(cell_key(32 * i, 32 * j, 32 * k)) for i, j, k in product(*sides)}
     found = np.full(2048, -1, dtype=np.int64)
-    place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-    assert kernels.cells_met(points, 0, 40, reach, pose, place, found, 500) == (1, len(expected))
+    place = CellGrid(*grid.origin, grid.voxel_size, float(grid.side))
+    assert kernels.cells_in_reach(points, 0, 40, reach, pose, place, found, 500) == (
+        1,
+        len(expected),
+    )
     assert set(found[found >= 0].tolist()) == expected
 
 

@@ -57,7 +57,7 @@ for n, (layout, curve) in enumerate(KINDS):
         if curve != "lexicographic":
             with CellTable.create(LEAST_BUDGET) as table:
                 frames = ResidentFrames(Residency(env.store, table), shell, run=4)
-                frames.feel(np.eye(4)[None])
+                frames.evaluate(np.eye(4)[None])
                 frames.close()
             point = hapticdb.PointShell(shell.points[:1], shell.normals[:1], shell.center)
             for each in (shell, loaded, point):

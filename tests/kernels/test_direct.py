@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.direct import render
-from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD, RISE_FRAMES
+from hapticdb.kernels.hand.fading import IS_FADING, IS_HELD, RISE_FRAMES
 from hapticdb.kernels.records.hand import RESULT, SERVO
 from hapticdb.kernels.records.layout import views_of
 from hapticdb.poses import rotation_of
@@ -34,14 +34,14 @@ class Tool:
         self.hand.quaternion[:] = (0.8, 0.0, 0.6, 0.0)
         self.felt = np.zeros((), RESULT)
 
-    def feel(self, wrench: ArrayLike, unknown: int = 0) -> None:
+    def evaluate(self, wrench: ArrayLike, unknown: int = 0) -> None:
         self.felt["wrench"], self.felt["hits"], self.felt["unknown"] = wrench, 3, unknown
         render(TERMS, CENTER, self.servo[()], self.felt[()], DT)
 
     def feel_long(self, wrench: ArrayLike, unknown: int = 0) -> Floats:
         """Wrench at the device after a time in which forces rise or fall to their end."""
         for _ in range(round(2.0 * (TERMS.hold + TERMS.fade) / DT)):
-            self.feel(wrench, unknown)
+            self.evaluate(wrench, unknown)
         return np.array(self.sent.wrench)
 
 
@@ -66,7 +66,7 @@ def test_a_force_rises_from_zero_when_a_session_starts() -> None:
     tool = Tool()
     rising = []
     for _ in range(30):
-        tool.feel((0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
+        tool.evaluate((0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
         rising.append(float(tool.sent.wrench[2]))
     steps = np.diff([0.0, *rising])
     assert (steps >= 0.0).all()
@@ -83,7 +83,7 @@ def test_while_little_is_known_the_tool_stays_and_the_force_falls_to_zero(lost: 
     tool.hand.position[0] = np.nan if lost == "nowhere" else 0.5
     tool.hand.is_stale[()] = lost == "stale"
     unknown = 4 if lost == "unknown" else 0
-    tool.feel(np.zeros(6), unknown)
+    tool.evaluate(np.zeros(6), unknown)
     assert (tool.sent.wrench == full).all()
     assert int(tool.sent.marks) == IS_HELD
     assert not tool.feel_long(np.zeros(6), unknown).any()

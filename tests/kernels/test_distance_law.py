@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from bands import BandRows, band_rows
 from hapticdb import Grid, PointShell
 from hapticdb.grid import CurveName
-from hapticdb.kernels.field import law as field
+from hapticdb.kernels.field import distance_law as field
 from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, HALF_WIDTH, STEPS
 from hapticdb.kernels.query import refining
 from hapticdb.kernels.records.cells import CONTROL, MISSED, READER
 from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident import cells as resident
-from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.cell_frames import evaluate_frames
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
-from hapticdb.query.frame import locate
-from hapticdb.resident.held import clusters_of
+from hapticdb.query.haptic_query import locate
+from hapticdb.resident.point_runs import clusters_of
 from naive_frame import NaiveTouch, distance_at, touch_distances
 from session import worlds
 
@@ -190,10 +190,10 @@ def on_cells(
 ) -> NDArray[np.void]:
     """RESULT of a frame on resident cells."""
     out, met = np.zeros(1, RESULT), np.empty(len(shell), dtype=np.int64)
-    place = resident.Place(*ORIGIN, SIZE, float(1 << BITS))
+    place = resident.CellGrid(*ORIGIN, SIZE, float(1 << BITS))
     clusters = clusters_of(shell, SIZE, run)
     missed = np.zeros((), MISSED)
-    feel_kernel(cells, 0, clusters, pose[None], place, LAW, met, missed, out)
+    evaluate_frames(cells, 0, clusters, pose[None], place, LAW, met, missed, out)
     return out[0]  # type: ignore[no-any-return]
 
 
@@ -266,11 +266,11 @@ def test_nothing_is_felt_beyond_the_proved_distance() -> None:
     """The field that is least at all 8 centres at once, at points all over a voxel's corner."""
     shares = np.linspace(0.0, 1.0, 11)
     places = np.stack(np.meshgrid(shares, shares, shares), axis=-1).reshape(-1, 3) + 10.5
-    least = min(least_distance_at(place, field.FELT_WITHIN) for place in places)
+    least = min(least_distance_at(place, field.FORCE_RANGE) for place in places)
     assert least > field.REACH
-    assert field.FELT_WITHIN < HALF_WIDTH + 3.0**0.5
+    assert field.FORCE_RANGE < HALF_WIDTH + 3.0**0.5
     # the bound is not much larger than it must be
-    close = min(least_distance_at(place, field.FELT_WITHIN - 0.2) for place in places)
+    close = min(least_distance_at(place, field.FORCE_RANGE - 0.2) for place in places)
     assert close < field.REACH
 
 

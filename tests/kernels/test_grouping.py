@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticdb.kernels.curves import HILBERT, LEXICOGRAPHIC, Z_ORDER, encode
-from hapticdb.kernels.query.grouping import gap_rows, group_by_cost, group_by_gap, ranges_of_box
+from hapticdb.kernels.query.key_ranges import gap_rows, group_by_cost, group_by_gap, ranges_of_box
 
 JIT = not numba.config.DISABLE_JIT
 few = settings(max_examples=300 if JIT else 60, deadline=None)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from banded import steps_to
+from hapticdb.kernels.field.distance_law import REACH
 from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, STEPS, VOXELS_A_STEP
-from hapticdb.kernels.field.law import REACH
 from hapticdb.kernels.resident.near_voxels import MOST_EIGHTHS, mark_near_voxels
 
 Floats = NDArray[np.float64]

@@ -28,7 +28,7 @@ from closed_forms import (
 from draws import is_every
 from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.device_spring import contact_stiffness
-from hapticdb.kernels.hand.holding import IS_HELD
+from hapticdb.kernels.hand.fading import IS_HELD
 from hapticdb.kernels.rigid import product, quaternion_by
 
 Floats = NDArray[np.float64]
@@ -341,7 +341,7 @@ def test_a_tool_astride_a_sheet_comes_free_without_a_step_and_is_then_held(seed:
     start = rng.uniform(-2.5, 2.5) * size * normal
     hand = Hand(field_of(sheet(normal), size), globe(3.0 * size), start, cap=8.0)
     hand.advance()
-    assert hand.sent.marks & quasistatic.IS_LOOSE
+    assert hand.sent.marks & quasistatic.IS_INSIDE
     for n in range(300):
         assert np.abs(hand.move(start + normal * size * n / 15.0)).max() == 0.0
     assert (hand.tool.position == hand.hand.position).all()

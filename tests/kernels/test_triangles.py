@@ -8,8 +8,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
-from hapticdb.kernels.triangles.nearest import nearest, own_gap, own_slack
+from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH, triangle_bvh
+from hapticdb.kernels.triangles.surface_distance import nearest, own_gap, own_slack
 
 Floats = NDArray[np.float64]
 
@@ -50,8 +50,8 @@ def kinds_of_pairs(rng: np.random.Generator) -> Iterator[tuple[str, Floats, Floa
     yield "a hundred to one", a, 0.01 * b + rng.normal(size=(COUNT, 1, 3))
 
 
-def one(triangle: Floats) -> TriangleTree:
-    return triangle_tree(triangle[None], np.zeros(1, dtype=np.int64))
+def one(triangle: Floats) -> TriangleBVH:
+    return triangle_bvh(triangle[None], np.zeros(1, dtype=np.int64))
 
 
 def from_triangle(places: Floats, triangle: Floats) -> float:
@@ -112,7 +112,7 @@ def test_two_trees_are_as_near_as_their_nearest_triangles() -> None:
         pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
         pose[:3, 3] = rng.uniform(-2.0, 2.0, 3)
         placed = b @ pose[:3, :3].T + pose[:3, 3]
-        mine, other = (triangle_tree(t, np.zeros(len(t), dtype=np.int64)) for t in (a, b))
+        mine, other = (triangle_bvh(t, np.zeros(len(t), dtype=np.int64)) for t in (a, b))
         found = nearest(mine, other, np.stack([pose, pose]), np.array([np.inf, np.inf]))
         at_least, at_most = brute(a, placed)
         assert np.allclose(found.at_least, at_least, rtol=0.0, atol=1e-12)

@@ -102,7 +102,7 @@ def test_an_mjcf_file_has_the_kinematics_of_mujoco(tmp_path: Path) -> None:
         pose = machine.placed(values, machine.names.index(name))[0]
         assert pose[:3, 3] == pytest.approx(data.body(name).xpos, abs=1e-12)
         assert pose[:3, :3].ravel() == pytest.approx(data.body(name).xmat, abs=1e-12)
-    assert machine.left_out == frozenset(map(frozenset, [("arm", "hand"), ("hand", "other")]))
+    assert machine.excluded == frozenset(map(frozenset, [("arm", "hand"), ("hand", "other")]))
     assert "plane" in machine.notes[0]
     ball = machine.surfaces[machine.names.index("hand")]
     assert np.abs(np.linalg.norm(ball.tree.corners, axis=2) - 0.05).max() < 1e-9
@@ -132,7 +132,7 @@ def test_an_srdf_file_names_the_pairs_that_are_left_out(tmp_path: Path) -> None:
         '<disable_collisions link1="arm" link2="unknown"/></robot>'
     )
     machine = read_machine(tmp_path / "m.xml", tmp_path / "m.srdf")
-    assert machine.left_out == frozenset([frozenset(("arm", "other"))])
+    assert machine.excluded == frozenset([frozenset(("arm", "other"))])
     (tmp_path / "m.srdf").write_text("<robot/>")
     with pytest.raises(FileError, match="no disable_collisions"):
         read_machine(tmp_path / "m.xml", tmp_path / "m.srdf")

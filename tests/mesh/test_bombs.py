@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import PointShell
 from hapticdb.errors import FileError, UsageError
 from hapticdb.ingest.files import ImportOptions, import_files
@@ -87,7 +87,7 @@ def test_names_along_deep_nodes_have_an_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes = [{"name": "n" * 11, "mesh": 0}]
-    monkeypatch.setattr("hapticdb.mesh.raw.MOST_CHARACTERS", 10)
+    monkeypatch.setattr("hapticdb.mesh.parsed.MOST_CHARACTERS", 10)
     for path in (gltf({"nodes": nodes}, tmp_path / "a.gltf"), text(tmp_path / "a.dae", COLLADA)):
         assert "nests its nodes too deeply" in cause(path)
 
@@ -164,7 +164,7 @@ def test_limits_are_options_of_an_import(tmp_path: Path) -> None:
     for options in ({"time_limit": 1e-3}, {"memory_limit": 1}):
         with pytest.raises(FileError, match=f"--{next(iter(options)).replace('_', '-')}"):
             import_files(tmp_path / "a.db", [path], ImportOptions(**options))
-    (report,) = import_files(tmp_path / "a.db", [path], ImportOptions(time_limit=PATIENCE))
+    (report,) = import_files(tmp_path / "a.db", [path], ImportOptions(time_limit=TIMEOUT))
     assert report.status == "imported"
     with pytest.raises(UsageError, match="above 0"):
         ImportOptions(time_limit=0.0)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 import step_files
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.surfaces.sides import triangle_tree
+from hapticdb.kernels.surfaces.triangle_bvh import triangle_bvh
 from hapticdb.mesh import Part, parse_in_process, read_file
 from hapticdb.mesh import reader as reader_module
 from hapticdb.mesh.chord import DEFAULT, chord_error
-from hapticdb.mesh.raw import UnreadableError
+from hapticdb.mesh.parsed import UnreadableError
 from mesh_files import TRIANGLE, gltf, text
 from point_distances import distances_to
 
@@ -25,7 +25,7 @@ SHARE = np.linspace(0.0, 1.0, 101)
 def distance(part: Part, points: Floats) -> float:
     """Greatest distance of points (..., 3) from a part's triangles, metres."""
     triangles = part.triangles()
-    tree = triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))
+    tree = triangle_bvh(triangles, np.zeros(len(triangles), dtype=np.int64))
     return float(distances_to(tree, points.reshape(-1, 3)).max())
 
 
@@ -148,7 +148,7 @@ def test_what_takes_too_long_says_that_a_larger_chord_is_faster(
     def late(*_: object) -> None:
         raise UnreadableError(f"it took long; {reader_module._MORE_TIME}")
 
-    monkeypatch.setattr(reader_module, "_ask_child", late)
+    monkeypatch.setattr(reader_module, "_run_child", late)
     step = step_files.sphere(tmp_path / "a.step", 1.0)
     for path, is_told in ((step, True), (text(tmp_path / "a.off", "OFF"), False)):
         with pytest.raises(FileError) as refused:

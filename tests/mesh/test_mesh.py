@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from hapticdb.mesh import UNITS, Defects, parse_in_process
 from hapticdb.mesh.clean import clean
+from hapticdb.mesh.parsed import Parsed, Placement, Shape, UnreadableError
 from hapticdb.mesh.polygons import triangulated
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
 from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
 
 # --- names and placements -------------------------------------------------------------------

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from hapticdb.mesh.packing import HEADER, pack, unpack
+from hapticdb.mesh.surface_packing import HEADER, pack, unpack
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -10,7 +10,7 @@ import pytest
 
 from file_seeds import seeds
 from hapticdb.mesh import SUFFIXES, parse_in_process, read_file
-from hapticdb.mesh.raw import UnreadableError, walk
+from hapticdb.mesh.parsed import UnreadableError, walk
 from mesh_files import cause, gltf, text, threemf
 
 
@@ -104,7 +104,7 @@ def test_deep_nodes_cost_no_stack(tmp_path: Path) -> None:
 
 
 def test_placements_that_multiply_are_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hapticdb.mesh.raw.MAX_NODES", 1000)
+    monkeypatch.setattr("hapticdb.mesh.parsed.MAX_NODES", 1000)
     eye = np.eye(4)
     with pytest.raises(UnreadableError, match="1,000"):
         for _ in walk([(0, eye)], lambda i: [(2 * i + 1, eye), (2 * i + 2, eye)]):

@@ -42,10 +42,10 @@ def test_the_page_plays_all_steps_in_their_order(tmp_path: Path) -> None:
     assert times == sorted(times)
     ended = 0.0
     for n, step in enumerate(steps):
-        assert step.way is not None
+        assert step.path is not None
         moved = of_node(messages, f"/part_{n}", "SetPositionMessage")
         places = np.array([one["position"] for _, one in moved])
-        start = places[-1] - step.way.poses[-1][:3, 3]
+        start = places[-1] - step.path.poses[-1][:3, 3]
         assert (start > step.shell.points.min(axis=0)).all()
         assert (start < step.shell.points.max(axis=0)).all()
         shown = next(t for t, one in moved if np.allclose(one["position"], start))

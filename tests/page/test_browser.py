@@ -6,7 +6,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from hapticdb.page import process
+from hapticdb.page import page_process
 from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
 
@@ -24,8 +24,8 @@ def test_a_browser_that_leaves_or_fails_while_its_panels_are_made_leaves_nothing
             raise OSError("no room")
         return MagicMock()
 
-    monkeypatch.setattr(process, "TabbedBrowser", made)
-    process.open_page(site, lambda _: Visitor("Ada", "viewer"))
+    monkeypatch.setattr(page_process, "TabbedBrowser", made)
+    page_process.open_page(site, lambda _: Visitor("Ada", "viewer"))
     (connect,) = connected.call_args.args
     if fails:
         with pytest.raises(OSError, match="no room"):
@@ -50,7 +50,7 @@ def test_what_is_not_seen_is_not_felt_when_it_comes(
     begun: list[bool] = []
     browser.site = SimpleNamespace(objects=dict.fromkeys((1, 3, 7)))  # type: ignore[assignment]
     browser.scene = SimpleNamespace(hidden=hidden, shade=lambda: None)  # type: ignore[assignment]
-    browser.chosen, browser.taken, browser._unfelt = (), None, felt_without
+    browser.chosen, browser.dragged_part, browser._excluded_ids = (), None, felt_without
     monkeypatch.setattr(browser, "begin_anew", lambda: begun.append(True))
     browser.objects_changed()
     assert len(begun) == n_begun

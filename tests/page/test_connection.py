@@ -12,7 +12,7 @@ from websockets.datastructures import Headers, HeadersLike
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from children import PATIENCE, until
+from children import TIMEOUT, until
 from hapticdb.page.connection import (
     BREAKS_RULES,
     LATE,
@@ -43,7 +43,7 @@ class Page(NamedTuple):
 @pytest.fixture
 def page() -> Iterator[Page]:
     ours, theirs = socket.socketpair()
-    ours.settimeout(PATIENCE)
+    ours.settimeout(TIMEOUT)
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     link = PageConnection(theirs.detach(), "the secret")
     link.guard(server)
@@ -55,7 +55,7 @@ def page() -> Iterator[Page]:
 def reached(page: Page, headers: HeadersLike) -> ClientConnection:
     """A connection to the page with these headers."""
     return connect(
-        page.address, additional_headers=headers, subprotocols=PROTOCOL, open_timeout=PATIENCE
+        page.address, additional_headers=headers, subprotocols=PROTOCOL, open_timeout=TIMEOUT
     )
 
 
@@ -74,7 +74,7 @@ def said(ours: socket.socket) -> dict[str, object]:
 
 def test_a_connection_with_the_secret_is_let_in_under_its_name(page: Page) -> None:
     with entered(page, "toucher") as browser:
-        assert browser.recv(timeout=PATIENCE)
+        assert browser.recv(timeout=TIMEOUT)
         assert page.link.visitor(0) == Visitor("Guest 1", "toucher")
         page.ours.sendall(line("ping"))
         assert said(page.ours)["word"] == "pong"
@@ -99,7 +99,7 @@ def test_whoever_lacks_the_secret_is_sent_away_with_nothing(
     named.update({NAME: "Guest 1", ROLE: "editor"})
     with reached(page, named) as browser:
         with pytest.raises(ConnectionClosed) as closed:
-            browser.recv(timeout=PATIENCE)
+            browser.recv(timeout=TIMEOUT)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == LATE
     assert said(page.ours)["word"] == "refused"

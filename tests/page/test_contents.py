@@ -18,7 +18,7 @@ from hapticdb.mesh import read_file
 from hapticdb.page.colours import FADED, MARKED, Colour, Rgba
 from hapticdb.page.scene.contents import Contents
 from hapticdb.page.scene.drawings import Audience
-from hapticdb.page.scene.nodes import Member, Sight
+from hapticdb.page.scene.nodes import Appearance, Member
 from hapticdb.page.scene.reading import ShapeReader
 from hapticdb.store.base import Object
 from recorded_scene import RecordedScene, are_same, drawn, write_parts
@@ -48,7 +48,7 @@ class Shown:
         return np.concatenate([np.empty((0, 3, 3)), *(self.triangles[i] for i in sorted(ids))])
 
 
-def marked_by(marks: dict[int, Colour]) -> Sight:
+def marked_by(marks: dict[int, Colour]) -> Appearance:
     """Sees the objects that have a mark, in its colour."""
     return lambda member: marks.get(member.id)
 
@@ -133,12 +133,12 @@ def test_one_browser_hides_marks_and_fades_for_itself(
     shown, own = shown_once(path), RecordedScene()
     state: dict[str, set[int]] = {"hidden": set(), "marked": set()}
 
-    def sight(member: Member) -> Colour | Rgba | None:
+    def appearance(member: Member) -> Colour | Rgba | None:
         if member.id in state["hidden"]:
             return None
         return shade if member.id in state["marked"] else member.colour
 
-    shown.contents.watch("one", Audience(cast("Any", own)), sight)
+    shown.contents.watch("one", Audience(cast("Any", own)), appearance)
     everything = set(shown.triangles)
     for _ in range(rounds + 1):
         state["hidden"], state["marked"] = hidden, marked

@@ -79,7 +79,7 @@ def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) ->
         errors = []
 
         def ask(job: Any) -> None:  # noqa: ANN401 - a job of the database
-            site.database.ask(job, str, browser.failed)
+            site.database.submit(job, str, browser.failed)
 
         drop_surfaces(scene)
         person.press("Take this part in hand")
@@ -152,12 +152,12 @@ def test_the_part_in_hand_is_the_only_one_that_is_unseen(scene: Path) -> None:
         for name in ("box.stl", "ball.stl"):
             part = choose(browser, name)
             person.press("Take this part in hand")
-            until(lambda i=part: browser.taken == i)  # type: ignore[misc]
+            until(lambda i=part: browser.dragged_part == i)  # type: ignore[misc]
         until(lambda: browser.scene.hidden == {part})
         tool = person.find("Tool")
         until(lambda: (person.look(0.05), person.widgets[tool]["value"] == PART)[1])
         person.press("Put it back")
-        until(lambda: (browser.scene.hidden, browser.taken) == (set(), None))
+        until(lambda: (browser.scene.hidden, browser.dragged_part) == (set(), None))
         until(lambda: (person.look(0.05), person.widgets[tool]["value"] == "ball")[1])
         assert person.told == []
 

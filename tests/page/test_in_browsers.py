@@ -26,8 +26,8 @@ from chromium import (
     until,
 )
 from hapticdb.page import tools
-from hapticdb.page.process import new_server
-from hapticdb.page.scene.picking import Struck
+from hapticdb.page.page_process import new_server
+from hapticdb.page.scene.picking import RayHit
 from hapticdb.page.scene.surroundings import framing
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.site import SceneFacts
@@ -67,7 +67,7 @@ def server(car: Path, tmp_path: Path) -> Iterator[Running]:
         yield found
 
 
-def first_of(view: SceneView, origin: Floats, way: Floats) -> Struck | None:
+def first_of(view: SceneView, origin: Floats, way: Floats) -> RayHit | None:
     return view.contents.pick(origin, way, lambda _: True)
 
 

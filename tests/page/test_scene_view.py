@@ -12,7 +12,7 @@ import hapticdb
 from assemblies import drop_surfaces
 from children import until
 from hapticdb.page.scene.contents import ALL
-from hapticdb.page.scene.picking import Struck
+from hapticdb.page.scene.picking import RayHit
 from hapticdb.page.scene.view import SceneView
 from hapticdb.store.base import Object
 from recorded_scene import write_parts
@@ -35,7 +35,7 @@ def all_shown(view: SceneView) -> None:
     until(lambda: view.contents.waiting() == 0)
 
 
-def from_above(view: SceneView, obj: Object) -> Struck | None:
+def from_above(view: SceneView, obj: Object) -> RayHit | None:
     """What a ray from above meets in the middle of an object."""
     middle = obj.bounds.mean(axis=0)
     return view.contents.pick(middle + np.array([0, 0, 3]), [0, 0, -1], lambda _: True)

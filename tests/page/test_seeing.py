@@ -14,10 +14,10 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels._sets import building
 from hapticdb.page.colours import MARKED
 from hapticdb.page.connection import Visitor
+from hapticdb.page.panels.jobs import COMPILES, WAITS, PanelJob, Progress
 from hapticdb.page.panels.tree import PartTree
 from hapticdb.page.panels.viewing import ViewControls
-from hapticdb.page.panels.working import COMPILES, WAITS, Progress, Work
-from hapticdb.page.scene.browser import SHEER
+from hapticdb.page.scene.browser_scene import SHEER
 from hapticdb.page.widgets import put
 from hapticdb.units import length_text
 from page_scene import page_of, two_parts
@@ -33,7 +33,7 @@ def test_a_job_says_what_is_done_and_then_its_result_stays() -> None:
     with ThreadPoolExecutor(1) as threads:
         site = SimpleNamespace(sweeping=threads)
         browser: Any = SimpleNamespace(site=site, has_gone=False, works=[])
-        work = Work(browser, MagicMock(), "a search", "pairs")
+        work = PanelJob(browser, MagicMock(), "a search", "pairs")
 
         def note() -> None:
             work.tick()
@@ -64,7 +64,7 @@ def test_a_job_says_what_is_done_and_then_its_result_stays() -> None:
 def test_the_shadow_is_that_of_what_is_shown(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(
-        "hapticdb.page.scene.browser.add_shadow", lambda _, boxes, *__: drawn.append(boxes)
+        "hapticdb.page.scene.browser_scene.add_shadow", lambda _, boxes, *__: drawn.append(boxes)
     )
     with page_of(scene) as (site, _, browser):
         (box, ball) = site.objects.values()
@@ -144,5 +144,5 @@ def test_the_distance_of_two_chosen_parts_is_exact(scene: Path) -> None:
         person.press("Measure between two chosen parts")
         person.wait_for(f">{length_text(found.at_most)}<")
         browser.scene.see_through(browser.chosen)
-        colours = [browser.scene._look.colour(SimpleNamespace(id=i)) for i in site.objects]  # type: ignore[arg-type]
+        colours = [browser.scene._state.colour(SimpleNamespace(id=i)) for i in site.objects]  # type: ignore[arg-type]
         assert colours == [(*MARKED, SHEER)] * 2

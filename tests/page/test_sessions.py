@@ -10,7 +10,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from children import PATIENCE, until
+from children import TIMEOUT, until
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
@@ -45,7 +45,7 @@ class FakeHost:
 
     def begin(self, _: object, start: object, **__: object) -> FakeSession:
         self.n_asked += 1
-        assert self.may_begin.wait(PATIENCE)
+        assert self.may_begin.wait(TIMEOUT)
         if self.is_failing:
             raise self.error
         self.begun.append(FakeSession(start))
@@ -56,7 +56,7 @@ class Person(Browser):
     """A browser without viser that keeps what it would tell and show its person."""
 
     def __init__(self, host: FakeHost, workers: ThreadPoolExecutor) -> None:
-        self.visitor, self.number, self.taken = Visitor("Ada", "toucher"), 0, None
+        self.visitor, self.number, self.dragged_part = Visitor("Ada", "toucher"), 0, None
         self.told: list[str] = []
         self.said: list[str] = []
         self.client, self.site = MagicMock(client_id=0), MagicMock(host=host, workers=workers)
@@ -68,9 +68,9 @@ class Person(Browser):
         self.stiffness = 1000.0
         self.hand, self.session = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), None
         self.drawing = SimpleNamespace(rest=lambda: self.said.append("rest"))  # type: ignore[assignment]
-        self._unfelt, self._keeps_tool, self._over, self._is_closed = [], None, [], False
+        self._excluded_ids, self._keeps_tool, self._over, self._is_closed = [], None, [], False
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
-        self._holding, self.colour = threading.Lock(), (0, 0, 0)
+        self._zeroing, self.colour = threading.Lock(), (0, 0, 0)
 
     def session_ended(self) -> None:
         self.said.append("session_ended")
@@ -131,8 +131,8 @@ def test_a_tool_that_is_taken_six_times_at_once_is_drawn_once_at_a_time(
         n_inside -= 1
 
     def press(_: int) -> None:
-        pressed.wait(PATIENCE)
-        person.take_in_hand(person.tool, person.hand)
+        pressed.wait(TIMEOUT)
+        person.use_tool(person.tool, person.hand)
 
     person.drawing = SimpleNamespace(hold=hold, rest=lambda: None)  # type: ignore[assignment]
     with ThreadPoolExecutor(6) as viser:
@@ -177,7 +177,7 @@ def test_many_quick_wishes_take_one_worker_and_the_newest_is_done(
         person.begin_anew()
     person.hand = np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0])
     free = person.site.workers.submit(lambda: "free")
-    assert free.result(PATIENCE) == "free"  # other browsers' workers
+    assert free.result(TIMEOUT) == "free"  # other browsers' workers
     host.may_begin.set()
     until(lambda: person.is_idle)
     assert len(host.begun) == 3  # the first, the slow one, and one for the eight

@@ -7,7 +7,7 @@ import pytest
 
 from hapticdb import PointShell
 from hapticdb.errors import UsageError
-from hapticdb.kernels.field.law import ONSET
+from hapticdb.kernels.field.distance_law import ONSET
 from hapticdb.page import colours, tools
 from hapticdb.page.scene.surroundings import set_first_view
 from hapticdb.page.site import SceneFacts

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 import hapticdb
 from assemblies import row_of_boxes
-from children import PATIENCE, until
+from children import TIMEOUT, until
 from hapticdb import Environment
 from hapticdb.errors import ConflictError, HapticDBError, ObjectNotFoundError, UsageError
 from hapticdb.page import database
-from hapticdb.page.editing import Edits, PersonsEdits
+from hapticdb.page.edits import Edits, PersonsEdits
 from hapticdb.store.base import Object
 from servers import ENGINES, named, url_on
 
@@ -225,7 +225,7 @@ def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
     answers: list[object] = []
 
     def wait_and_open(*args: Any, **options: Any) -> Any:  # noqa: ANN401
-        assert may_go_on.wait(PATIENCE)
+        assert may_go_on.wait(TIMEOUT)
         opened.append(threading.current_thread())
         if len(opened) == 1:
             raise HapticDBError("the server is away")
@@ -238,7 +238,7 @@ def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
     jobs += [(0, lambda own: own.undo())]
     try:
         for person, job in jobs:
-            edits.ask(person, job, answers.append, answers.append)
+            edits.submit(person, job, answers.append, answers.append)
         assert (opened, answers) == ([], [])
         may_go_on.set()
         until(lambda: len(answers) == len(jobs))

@@ -13,7 +13,7 @@ import hapticdb
 from hapticdb import demo
 from hapticdb.cli import main
 from hapticdb.errors import UsageError
-from hapticdb.pictures import demo as demo_picture
+from hapticdb.pictures import demo_picture
 
 FRAMES = 25
 
@@ -40,8 +40,8 @@ def test_every_strategy_agrees_on_both_layouts(comparison: demo.Comparison) -> N
     layouts = [measured.imported.layout for measured in comparison.layouts]
     assert layouts == ["brick", "voxel"]
     for measured in comparison.layouts:
-        assert tuple(measured.felt) == demo.COMPARED
-        assert all(len(queries) == FRAMES for queries in measured.felt.values())
+        assert tuple(measured.queries) == demo.COMPARED
+        assert all(len(queries) == FRAMES for queries in measured.queries.values())
     assert len({measured.imported.voxels for measured in comparison.layouts}) == 1
 
 

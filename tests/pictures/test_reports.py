@@ -16,8 +16,8 @@ import pytest
 import hapticdb
 from command_line import Run, refused
 from hapticdb.clashes.groups import groups_of
-from hapticdb.clashes.run import find_clashes
-from hapticdb.pictures.clashes import SIZE
+from hapticdb.clashes.search import find_clashes
+from hapticdb.pictures.clash_page import SIZE
 from hapticdb.pictures.reports import junit
 from hapticdb.verdicts import Kind
 from ifc_files import Building

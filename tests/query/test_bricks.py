@@ -11,15 +11,15 @@ import pytest
 
 import hapticdb
 from banded import write_points
-from children import PATIENCE, finished, until
+from children import TIMEOUT, finished, until
 from hapticdb import Environment, Touch
 from hapticdb.errors import DamagedError, UsageError
 from hapticdb.grid import CurveName
 from hapticdb.kernels.records import rows as records
-from hapticdb.query.bricks import BrickMemory
+from hapticdb.query.brick_cache import BrickCache
 from hapticdb.query.law import LawName
 from hapticdb.store.base import Band, Keys, Rows
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 from kernels.test_distance_law import random_pose, random_shell
 from postgres_servers import Binaries
 from query.test_distance_law import CURVES, make
@@ -61,7 +61,7 @@ def check(env: Environment, law: LawName, exclude: list[int] | tuple[()] = ()) -
     return n_contacts
 
 
-def memory_of(env: Environment) -> BrickMemory:
+def memory_of(env: Environment) -> BrickCache:
     memory = env._query._memory
     assert memory is not None
     return memory
@@ -178,15 +178,15 @@ def test_frames_that_need_more_than_fits_are_right(
     check(env, "distance")
     memory = memory_of(env)
     most = 0
-    enter = BrickMemory.enter
+    enter = BrickCache.enter
 
-    def noted(self: BrickMemory, keys: Keys, rows: Rows) -> bool:
+    def noted(self: BrickCache, keys: Keys, rows: Rows) -> bool:
         nonlocal most
         did = enter(self, keys, rows)
         most = max(most, self._used)
         return did
 
-    monkeypatch.setattr(BrickMemory, "enter", noted)
+    monkeypatch.setattr(BrickCache, "enter", noted)
     needed = memory._used
     held = [env.touch(SHELL, pose, law="distance") for pose in POSES]
     wanted = [env.touch(SHELL, pose, "array", law="distance") for pose in POSES]
@@ -204,7 +204,7 @@ def test_frames_that_need_more_than_fits_are_right(
 
 
 def test_the_directory_grows_with_its_bricks(env: Environment) -> None:
-    memory = BrickMemory(env.url)
+    memory = BrickCache(env.url)
     keys = np.arange(0, 5000 * 7, 7)
     for some in np.split(keys, 10):
         assert memory.absent(keys).tolist() == keys[keys >= some[0]].tolist()
@@ -250,7 +250,7 @@ def test_memory_belongs_to_the_thread_of_its_environment(env: Environment) -> No
         ThreadPoolExecutor(1) as thread,
         pytest.raises(UsageError, match="belongs to the thread that opened it"),
     ):
-        thread.submit(env.touch, SHELL, POSES[0]).result(PATIENCE)
+        thread.submit(env.touch, SHELL, POSES[0]).result(TIMEOUT)
 
 
 def test_a_pose_that_is_not_rigid_is_refused_over_memory(env: Environment) -> None:

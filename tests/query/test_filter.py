@@ -68,7 +68,7 @@ def ids_of(words: list[int | str]) -> set[int]:
     return {i for word in words for i in CHOSEN[word]}
 
 
-def left_out(where: list[int | str], exclude: list[int | str]) -> list[int]:
+def excluded(where: list[int | str], exclude: list[int | str]) -> list[int]:
     everything = {1, 2, 3, 4, 5}
     felt = (ids_of(where) if where else everything) - ids_of(exclude)
     return sorted(everything - felt)
@@ -125,18 +125,18 @@ def test_all_that_touch_feel_what_a_plain_set_without_the_others_does(
     exclude: list[int | str],
 ) -> None:
     shell, pose = random_shell(seed, n_points), random_pose(seed)
-    wanted = expected(plain, shell, pose, left_out(where, exclude))
+    wanted = expected(plain, shell, pose, excluded(where, exclude))
     for strategy in STRATEGIES:
         touch = env.touch(shell, pose, strategy, where=where, exclude=exclude)
         assert_same(touch, wanted)
     words: dict[str, Any] = {"where": where, "exclude": exclude}
-    with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=1, **words) as feeler:
-        many = feeler.touch([pose, pose])
+    with env.batch_tool(shell, budget_bytes=LEAST_BUDGET, jobs=1, **words) as batch_tool:
+        many = batch_tool.touch([pose, pose])
     assert many.forces.tolist() == [list(wanted.force)] * 2
     assert many.torques.tolist() == [list(wanted.torque)] * 2
     assert many.hits.tolist() == [len(wanted.hits)] * 2
-    found = {obj.id for obj in env.felt(where, exclude)}
-    assert found == {1, 2, 3, 4, 5} - set(left_out(where, exclude))
+    found = {obj.id for obj in env.select(where, exclude)}
+    assert found == {1, 2, 3, 4, 5} - set(excluded(where, exclude))
 
 
 @pytest.mark.parametrize(

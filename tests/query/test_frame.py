@@ -239,5 +239,5 @@ def test_contacts_have_places_normals_and_depths(tmp_path: Path) -> None:
     turned = shell.normals[touch.contacts] @ pose[:3, :3].T
     np.testing.assert_allclose(touch.contact_normals, turned, atol=1e-12)
     assert (touch.contact_depths > 0).all()
-    is_felt = np.isin(touch.hits, touch.contacts)
-    assert touch.contact_depths.tolist() == touch.depths[is_felt].tolist()
+    is_included = np.isin(touch.hits, touch.contacts)
+    assert touch.contact_depths.tolist() == touch.depths[is_included].tolist()

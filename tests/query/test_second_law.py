@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.kernels import law as kernels
+from hapticdb.kernels import force_law as kernels
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
@@ -87,10 +87,10 @@ def expected(shell: PointShell, pose: Array) -> NaiveTouch:
 @pytest.mark.long
 def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) -> None:
     shell = random_shell(300, 300, 8.0, SIZE)
-    n_felt = 0
+    n_contacts = 0
     with CellTable.create(LEAST_BUDGET) as table:
         frames = ResidentFrames(Residency(env.store, table), shell, Penalty())
-        felt = frames.feel(poses())
+        felt = frames.evaluate(poses())
         frames.close()
     for n, pose in enumerate(poses()):
         wanted = expected(shell, pose)
@@ -102,7 +102,7 @@ def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) 
             assert np.array_equal([*touch.force, *touch.torque], wrench)
         assert np.array_equal(felt.wrenches[n], wrench)
         assert felt.hits[n] == felt.contacts[n] == len(wanted.hits)
-        n_felt += len(wanted.hits)
-    assert n_felt > 0
+        n_contacts += len(wanted.hits)
+    assert n_contacts > 0
     with pytest.raises(ValueError, match="this law is off"):
         env.touch(shell, poses()[0], law=Penalty(is_on=False))

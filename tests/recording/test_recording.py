@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from children import PATIENCE, exit_code, until
+from children import TIMEOUT, exit_code, until
 from draws import drawn
 from hapticdb import Coupling, PointShell
 from hapticdb.devices.profiles import PROFILES
@@ -307,7 +307,7 @@ def test_a_session_goes_on_without_its_recording(sphere: PointShell, tmp_path: P
         record=path, record_limit_bytes=50_000,
     ) as session:  # fmt: skip
         assert session.recording_ended is None
-        report = session.wait(PATIENCE)
+        report = session.wait(TIMEOUT)
     assert report is not None
     n_frames = len(recorded(path))
     assert f"ends after {n_frames:,} frames, at its limit" in str(report.recording_ended)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticdb import PointShell
-from hapticdb.resident.frames import FeltFrames, ResidentFrames
+from hapticdb.resident.frames import FrameResults, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from session.worlds import make, scatter, turned
@@ -42,15 +42,15 @@ def walk(count: int, seed: int, step: float, reach: float) -> Poses:
     return poses
 
 
-def same(one: FeltFrames, other: FeltFrames) -> bool:
+def same(one: FrameResults, other: FrameResults) -> bool:
     """Whether two results have the same bits."""
     return all((a + 0.0).tobytes() == (b + 0.0).tobytes() for a, b in zip(one, other, strict=True))
 
 
-def in_parts(frames: ResidentFrames, poses: Poses, size: int) -> FeltFrames:
+def in_parts(frames: ResidentFrames, poses: Poses, size: int) -> FrameResults:
     """The frames at all poses, a few at a time, as a session asks for them."""
-    parts = [frames.feel(poses[at : at + size]) for at in range(0, len(poses), size)]
-    return FeltFrames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    parts = [frames.evaluate(poses[at : at + size]) for at in range(0, len(poses), size)]
+    return FrameResults(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 @given(st.integers(0, 10_000))
@@ -64,7 +64,7 @@ def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed:
     poses = walk(60, seed, float(rng.choice([1e-5, 1e-3, 1e-2])), 0.15)
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)
-        flat = ResidentFrames(residency, shell, run=0).feel(poses)
+        flat = ResidentFrames(residency, shell, run=0).evaluate(poses)
         for run in (1, int(rng.integers(2, 64)), 64, None):
             clustered = ResidentFrames(residency, shell, run=run)
             assert same(in_parts(clustered, poses, int(rng.integers(1, 20))), flat)

@@ -11,7 +11,7 @@ from hapticdb import Environment, user_cache
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.resident import source as module
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.source import ASKED, FAR, costs_at_start
+from hapticdb.resident.source import FAR, ROUND_TRIPS, costs_at_start
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Store
 from session.troubled import troubled
@@ -68,7 +68,7 @@ def test_a_database_nearby_is_measured(env: Environment, measured: list[Store]) 
     line = Line(FAR / 2)
     assert costs_at_start(line.to(env), lambda: line.now) == MEASURED
     write(env)
-    readings = iter([0.0, *[1.0] * (2 * ASKED - 1)])
+    readings = iter([0.0, *[1.0] * (2 * ROUND_TRIPS - 1)])
     assert costs_at_start(env.store, lambda: next(readings)) == MEASURED
     assert len(measured) == 2
 
@@ -98,7 +98,7 @@ def test_a_start_over_a_slow_line_takes_a_few_round_trips(env: Environment) -> N
     line = Line(0.15)
     with CellTable.create(LEAST_BUDGET) as table:
         Residency(line.to(env), table, clock=lambda: line.now)
-    assert ASKED < line.trips <= ASKED + 6
+    assert ROUND_TRIPS < line.trips <= ROUND_TRIPS + 6
 
 
 @pytest.mark.usefixtures("env")

@@ -12,7 +12,7 @@ from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
 from hapticdb.query.law import DISTANCE, PLANE, ForceLaw
 from hapticdb.resident.frames import ResidentFrames
-from hapticdb.resident.held import RUN
+from hapticdb.resident.point_runs import RUN
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout
@@ -37,7 +37,7 @@ def test_frames_are_the_oracles_bit_for_bit(
         with CellTable.create(LEAST_BUDGET) as table:
             frames = ResidentFrames(Residency(env.store, table, exclude), shell, run=run)
             collides = frames.collides(poses)
-            felt = frames.feel(poses)
+            felt = frames.evaluate(poses)
             frames.close()
         assert collides.tolist() == (felt.hits > 0).tolist()
         assert felt.hits.any()
@@ -63,7 +63,7 @@ def test_a_tool_that_needs_more_cells_than_the_table_has_is_refused(tmp_path: Pa
         assert table.n_slots < 512
         larger = ResidentFrames(Residency(env.store, table), cloud(5000, extent=0.1))
         with pytest.raises(UsageError, match=r"more than fit into .*give a larger budget"):
-            larger.feel(np.eye(4))
+            larger.evaluate(np.eye(4))
 
 
 def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Pat
         frames = ResidentFrames(Residency(env.store, table), shell)
         n_cells = len(np.unique(env.grid.voxels_of(points) // 32, axis=0))
         assert n_cells <= (table.n_slots - 1) // 2 < 8 * n_cells
-        felt = frames.feel(np.eye(4))
+        felt = frames.evaluate(np.eye(4))
         assert (felt.unknown[0], felt.hits[0]) == (0, len(points))
 
 

@@ -126,9 +126,9 @@ def test_cells_follow_the_words_of_a_filter(tmp_path: Path, table: CellTable) ->
         record = replace(voxel_object(env.grid, ijk, name), attributes={"material": material})
         return env.store.add(record, rows_of_voxels(ijk, env.grid, env.layout))
 
-    def check_cells(residency: Residency, *left_out: int) -> None:
+    def check_cells(residency: Residency, *excluded: int) -> None:
         residency.make_resident(cells_of(env.grid)[:40])
-        assert check(residency, voxels_by_cell(env, left_out))
+        assert check(residency, voxels_by_cell(env, excluded))
 
     env = make(tmp_path)
     named("a1", 0, "steel"), named("a2", 1, "wood"), named("b", 2, "steel")
@@ -383,7 +383,7 @@ def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) ->
         def hammer() -> None:
             reader = Reader(table, env.grid, shell)
             while not done.is_set():
-                hits, _, unknown = reader.feel(np.eye(4))
+                hits, _, unknown = reader.evaluate(np.eye(4))
                 met = [sum(4 * n <= hit < 4 * n + 4 for hit in hits) for n in range(4)]
                 if unknown == 0 and met[:2] not in ([4, 0], [0, 4]):
                     wrong.append(("two places", met))

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from children import PATIENCE, child, joined, until
+from children import TIMEOUT, child, joined, until
 from hapticdb.errors import UsageError
 from hapticdb.resident.table import LEAST_BUDGET, MOST_READERS, CellTable, is_alive
 
@@ -109,7 +109,7 @@ def test_a_zombie_that_is_waited_for_at_that_moment_does_not_run(
         until(lambda: not is_alive(gone.pid))
 
         def read_text(path: Path) -> str:
-            gone.wait(PATIENCE)
+            gone.wait(TIMEOUT)
             raise FileNotFoundError(path)
 
         with monkeypatch.context() as patched:

@@ -10,7 +10,7 @@ from starlette.requests import Request
 from hapticdb.errors import UsageError
 from hapticdb.server import access
 from hapticdb.server.access import Access, Role
-from hapticdb.server.front_page import ClientPage, FrontDoor
+from hapticdb.server.front_page import ClientPage, SignIn
 from hapticdb.server.limits import Limits
 
 VIEWER = "a-token-for-viewers"
@@ -59,7 +59,7 @@ def test_whoever_shows_nothing_that_is_known_has_no_role(headers: dict[str, str]
 def test_attempts_are_counted_for_each_address() -> None:
     """An IPv6 address stands for its network of 64 bits."""
     limits = replace(Limits(), sign_ins_per_second=1e-9, sign_ins_at_once=1.0)
-    door = FrontDoor(of_two_roles(Clock()), cast("ClientPage", None), limits, "", "title")
+    door = SignIn(of_two_roles(Clock()), cast("ClientPage", None), limits, "", "title")
 
     def status(address: str) -> int:
         request = SimpleNamespace(client=SimpleNamespace(host=address), method="POST")

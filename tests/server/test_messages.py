@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from viser import _messages as viser_messages
 
 from hapticdb.server.access import Role
-from hapticdb.server.messages import LARGEST, Known, Verdict, judged
+from hapticdb.server.messages import LARGEST, Known, Verdict, validated
 from serving import CAMERA
 
 encode = msgspec.msgpack.encode
@@ -33,7 +33,7 @@ CLICK = {
 
 @pytest.mark.parametrize("message", [CAMERA, GIZMO, CLICK])
 def test_what_viser_sends_passes_with_the_same_content(message: dict[str, object]) -> None:
-    passed = judged(encode(message), Role.EDITOR).passed
+    passed = validated(encode(message), Role.EDITOR).passed
     assert passed is not None
     assert message.items() <= msgspec.msgpack.decode(passed).items()
 
@@ -47,7 +47,7 @@ def test_each_type_is_a_message_of_viser(kind: type[msgspec.Struct]) -> None:
 @pytest.mark.parametrize("content", [True, 0.5, "word", [1, 2.5], ["a", "b"], None])
 def test_values_of_widgets_pass(content: object) -> None:
     message = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": content}}
-    passed = judged(encode(message), Role.VIEWER).passed
+    passed = validated(encode(message), Role.VIEWER).passed
     assert passed is not None
     assert msgspec.msgpack.decode(passed)["updates"] == {"value": content}
 
@@ -57,7 +57,7 @@ def test_values_of_widgets_pass(content: object) -> None:
 )
 def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
     for more in ({}, {"uuid": "a"}, {"name": "/tool", "updates": {"visible": False}}):
-        assert judged(encode({"type": type_} | more), Role.EDITOR) == Verdict(None, "type")
+        assert validated(encode({"type": type_} | more), Role.EDITOR) == Verdict(None, "type")
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
 )
 def test_no_other_attribute_and_no_wild_value_passes(updates: dict[str, object]) -> None:
     message = {"type": "GuiUpdateMessage", "uuid": "a", "updates": updates}
-    assert judged(encode(message), Role.EDITOR) == Verdict(None, "malformed")
+    assert validated(encode(message), Role.EDITOR) == Verdict(None, "malformed")
 
 
 @pytest.mark.parametrize(
@@ -98,21 +98,21 @@ def test_no_other_attribute_and_no_wild_value_passes(updates: dict[str, object])
     ],
 )
 def test_a_gizmo_or_a_click_with_wrong_fields_does_not_pass(message: dict[str, object]) -> None:
-    assert judged(encode(message), Role.EDITOR) == Verdict(None, "malformed")
+    assert validated(encode(message), Role.EDITOR) == Verdict(None, "malformed")
 
 
 def test_a_viewer_moves_no_gizmo_and_a_toucher_does() -> None:
-    assert judged(encode(GIZMO), Role.VIEWER) == Verdict(None, "role")
-    assert judged(encode(GIZMO), Role.TOUCHER).passed is not None
+    assert validated(encode(GIZMO), Role.VIEWER) == Verdict(None, "role")
+    assert validated(encode(GIZMO), Role.TOUCHER).passed is not None
 
 
 def test_no_message_is_large() -> None:
-    assert judged(b"\x91" * (LARGEST + 1), Role.EDITOR) == Verdict(None, "size")
+    assert validated(b"\x91" * (LARGEST + 1), Role.EDITOR) == Verdict(None, "size")
 
 
 @given(st.binary(max_size=300))
 def test_any_bytes_are_judged_without_an_error(message: bytes) -> None:
-    assert judged(message, Role.EDITOR).passed is None or msgspec.msgpack.decode(message)
+    assert validated(message, Role.EDITOR).passed is None or msgspec.msgpack.decode(message)
 
 
 @given(st.data())
@@ -120,5 +120,5 @@ def test_damaged_messages_are_judged_without_an_error(data: st.DataObject) -> No
     message = bytearray(encode(data.draw(st.sampled_from([CAMERA, GIZMO]))))
     for _ in range(3):
         message[data.draw(st.integers(0, len(message) - 1))] = data.draw(st.integers(0, 255))
-    passed = judged(bytes(message), Role.EDITOR).passed
+    passed = validated(bytes(message), Role.EDITOR).passed
     assert passed is None or msgspec.msgpack.decode(passed)["type"]

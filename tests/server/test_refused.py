@@ -13,7 +13,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb.server.guards import Guards
 from hapticdb.server.limits import Limits
 from hapticdb.server.transports import limited
@@ -41,12 +41,12 @@ async def serving(app: ASGIApp, limits: Limits) -> AsyncIterator[tuple[str, int]
         running = asyncio.create_task(server.serve([listening]))
         yield listening.getsockname()
         server.should_exit = True
-        await asyncio.wait_for(running, PATIENCE)
+        await asyncio.wait_for(running, TIMEOUT)
 
 
 def status(place: tuple[str, int]) -> int:
     """Status of the answer to a request."""
-    connection = HTTPConnection(*place, timeout=PATIENCE)
+    connection = HTTPConnection(*place, timeout=TIMEOUT)
     with contextlib.closing(connection):
         connection.request("GET", "/healthz")
         return connection.getresponse().status
@@ -54,13 +54,13 @@ def status(place: tuple[str, int]) -> int:
 
 def test_idle_connections_leave_room_for_requests() -> None:
     """More than the server takes at once; some have sent a part of a request."""
-    limits = Limits(connections=32, silent=8, request_seconds=PATIENCE)
+    limits = Limits(connections=32, silent=8, request_seconds=TIMEOUT)
 
     async def work() -> None:
         async with serving(answer, limits) as place:
             with contextlib.ExitStack() as idle:
                 for n in range(2 * limits.connections):
-                    made = idle.enter_context(socket.create_connection(place, PATIENCE))
+                    made = idle.enter_context(socket.create_connection(place, TIMEOUT))
                     made.sendall(b"GET / HTTP/1.1\r\nHost:" if n % 2 else b"")
                     await asyncio.sleep(0)
                 assert await asyncio.to_thread(status, place) == 200
@@ -69,22 +69,22 @@ def test_idle_connections_leave_room_for_requests() -> None:
 
 
 def test_a_request_that_is_answered_is_not_cut_by_idle_connections() -> None:
-    limits = Limits(silent=2, request_seconds=PATIENCE)
+    limits = Limits(silent=2, request_seconds=TIMEOUT)
 
     async def work() -> None:
         has_come, may_answer = asyncio.Future[None](), asyncio.Future[None]()
 
         async def answer_late(scope: Scope, receive: Receive, send: Send) -> None:
             has_come.set_result(None)
-            await asyncio.wait_for(may_answer, PATIENCE)
+            await asyncio.wait_for(may_answer, TIMEOUT)
             await answer(scope, receive, send)
 
         async with serving(answer_late, limits) as place:
             asked = asyncio.create_task(asyncio.to_thread(status, place))
-            await asyncio.wait_for(has_come, PATIENCE)
+            await asyncio.wait_for(has_come, TIMEOUT)
             with contextlib.ExitStack() as idle:
                 for _ in range(8):
-                    made = await asyncio.to_thread(socket.create_connection, place, PATIENCE)
+                    made = await asyncio.to_thread(socket.create_connection, place, TIMEOUT)
                     idle.enter_context(made)
                 may_answer.set_result(None)
                 assert await asked == 200
@@ -98,7 +98,7 @@ def test_a_refused_websocket_logs_no_error(host: str, caplog: pytest.LogCaptureF
         await WebSocket(scope, receive, send).close(1008)
 
     def refused(place: tuple[str, int]) -> bytes:
-        with socket.create_connection(place, PATIENCE) as client:
+        with socket.create_connection(place, TIMEOUT) as client:
             client.sendall(UPGRADE.format(host=host).encode())
             return client.recv(1 << 16)
 

@@ -14,9 +14,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import hapticdb
-from children import PATIENCE, descendants, named, until
+from children import TIMEOUT, descendants, named, until
 from hapticdb.errors import UsageError
-from hapticdb.server import access, page_keeper, relay
+from hapticdb.server import access, page_supervisor, relay
 from hapticdb.server.access import Role
 from hapticdb.server.limits import Limits
 from hapticdb.server.served import Serving, check
@@ -163,9 +163,9 @@ def test_a_page_that_was_killed_is_started_again_when_the_machine_has_room(
             raise BlockingIOError(errno.EAGAIN, "no room for a process")
         return Process(*given)
 
-    monkeypatch.setattr(page_keeper, "FIRST_PAUSE", 0.05)
+    monkeypatch.setattr(page_supervisor, "FIRST_PAUSE", 0.05)
     with running(serving) as server:
-        monkeypatch.setattr(page_keeper, "Process", begin)
+        monkeypatch.setattr(page_supervisor, "Process", begin)
         with server.browser(Role.EDITOR) as browser:
             sent(browser, CAMERA)
             text_until(browser, "is a editor")
@@ -211,7 +211,7 @@ def test_what_is_silent_or_asks_twice_is_cut(environment: Path) -> None:
 def _all_read(server: Running, said: str) -> bytes:
     """What the server says until it cuts the connection; nothing if it was quicker than we are."""
     with (
-        socket.create_connection(("127.0.0.1", server.port), PATIENCE) as slow,
+        socket.create_connection(("127.0.0.1", server.port), TIMEOUT) as slow,
         contextlib.suppress(ConnectionError),
     ):
         slow.sendall(said.encode())

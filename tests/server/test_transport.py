@@ -13,7 +13,7 @@ import pytest
 from websockets.asyncio.client import connect as connect_in_loop
 from websockets.sync.client import connect
 
-from children import PATIENCE, finished
+from children import TIMEOUT, finished
 from hapticdb.server.served import Serving
 from hapticdb.server.transports import StrictWebSocket
 from serving import CAMERA, PROTOCOL, TOKENS, running, urls
@@ -35,16 +35,16 @@ def test_a_browser_uses_the_page_over_tls(environment: Path, tmp_path: Path) -> 
     async def first_frame(place: str) -> str | bytes:
         async with connect_in_loop(
             f"wss://{place}", ssl=trust, subprotocols=PROTOCOL, proxy=None, compression=None,
-            additional_headers=SHOWN | {"Origin": f"https://{place}"}, open_timeout=PATIENCE,
+            additional_headers=SHOWN | {"Origin": f"https://{place}"}, open_timeout=TIMEOUT,
         ) as browser:  # fmt: skip
             await browser.send(msgspec.msgpack.encode(CAMERA))
-            return await asyncio.wait_for(anext(aiter(browser)), PATIENCE)
+            return await asyncio.wait_for(anext(aiter(browser)), TIMEOUT)
 
     serving = Serving(
         urls(environment), tokens=TOKENS, certificate=certificate, key=key, page="viser_page:work"
     )
     with running(serving) as secure:
-        asked = HTTPSConnection("127.0.0.1", secure.port, timeout=PATIENCE, context=trust)
+        asked = HTTPSConnection("127.0.0.1", secure.port, timeout=TIMEOUT, context=trust)
         with closing(asked):
             asked.request("GET", f"/?token={TOKEN}")
             answer = asked.getresponse()
@@ -71,7 +71,7 @@ def test_small_messages_leave_at_once_and_uncompressed(
         running(serving) as found,
         connect(
             f"ws://{found.place}/", additional_headers=SHOWN | {"Origin": f"http://{found.place}"},
-            subprotocols=PROTOCOL, proxy=None, compression="deflate", open_timeout=PATIENCE,
+            subprotocols=PROTOCOL, proxy=None, compression="deflate", open_timeout=TIMEOUT,
         ) as asking,
     ):  # fmt: skip
         assert asking.request is not None

@@ -14,12 +14,12 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocketState
 
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb.server import relay
 from hapticdb.server.access import Access
-from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits
-from hapticdb.server.page_keeper import PageKeeper
+from hapticdb.server.metrics import Metrics
+from hapticdb.server.page_supervisor import PageSupervisor
 from hapticdb.server.relay import Relay
 from hapticdb.server.transports import StrictWebSocket
 from server.test_refused import UPGRADE
@@ -37,15 +37,15 @@ async def unread(app: ASGIApp, *, ping: float | None) -> AsyncIterator[uvicorn.S
     server = uvicorn.Server(config)
     with socket.create_server(("127.0.0.1", 0)) as listening:
         serving = asyncio.create_task(server.serve([listening]))
-        with socket.create_connection(listening.getsockname(), PATIENCE) as client:
+        with socket.create_connection(listening.getsockname(), TIMEOUT) as client:
             client.sendall(UPGRADE.format(host="127.0.0.1").encode())
             yield server
         server.should_exit = True
-        await asyncio.wait_for(serving, PATIENCE)
+        await asyncio.wait_for(serving, TIMEOUT)
 
 
 async def until(claim: Callable[[], object]) -> None:
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while not claim():
         assert time.monotonic() < deadline
         await asyncio.sleep(0.01)
@@ -98,7 +98,7 @@ def unwilling() -> Any:  # noqa: ANN401 - in place of a WebSocket
     """A WebSocket that sends something malformed and takes no close frame."""
 
     async def close(*_: object) -> NoReturn:
-        await asyncio.sleep(2.0 * PATIENCE)
+        await asyncio.sleep(2.0 * TIMEOUT)
         raise AssertionError
 
     made = AsyncMock(application_state=WebSocketState.CONNECTED, headers=Headers(), close=close)
@@ -107,12 +107,12 @@ def unwilling() -> Any:  # noqa: ANN401 - in place of a WebSocket
 
 
 def test_a_browser_that_takes_no_close_frame_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(relay, "CLOSING_PATIENCE", 0.01)
-    figures = Figures()
-    served = Relay(Access({}), cast("PageKeeper", None), Limits(), figures)
+    monkeypatch.setattr(relay, "CLOSING_TIMEOUT", 0.01)
+    figures = Metrics()
+    served = Relay(Access({}), cast("PageSupervisor", None), Limits(), figures)
 
     async def work() -> None:
-        await asyncio.wait_for(served.browser(unwilling()), PATIENCE)
+        await asyncio.wait_for(served.browser(unwilling()), TIMEOUT)
 
     asyncio.run(work())
     assert b'hapticdb_browser_connections_total{end="refused"} 1.0' in figures.text()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import children
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import Environment, PointShell
 from hapticdb.poses import poses_of
 from hapticdb.query.law import ForceLaw
@@ -29,7 +29,7 @@ def until(claim: Callable[[], object], session: Session | None = None) -> None:
     if session is None:
         children.until(claim)
         return
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT
     while not claim():
         assert time.monotonic() < deadline
         assert session.wait(0.02) is None

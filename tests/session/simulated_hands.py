@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 import closed_forms
 from banded import write_points
-from children import PATIENCE
+from children import TIMEOUT
 from closed_forms import UPRIGHT, Field, Hand, field_of, hole, moved, plane, punch, sheet
 from hapticdb import PointShell
 from hapticdb.devices.scripted import Player
-from hapticdb.kernels.gpu import looks as kernels
+from hapticdb.kernels.gpu import proximity_queries as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN, key_of_cell
 from hapticdb.recording.file import Recording
 from hapticdb.resident.table import CellTable
@@ -159,7 +159,7 @@ def a_session_feels_says_where_and_is_replayed() -> None:
             env.url, PointShell.sphere(0.004, 20), Pressing(), rate=20.0, frames_on="cuda",
             record=path, staleness=NEVER_STALE, has_baseline=False,
         ) as session:  # fmt: skip
-            report = session.wait(PATIENCE)
+            report = session.wait(TIMEOUT)
         assert report is not None
         assert report.contact_frames > 0
         assert report.peak_force > 0.0

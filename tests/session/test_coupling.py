@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from hapticdb.devices.profiles import PROFILES, SCRIPTED, DeviceProfile
-from hapticdb.devices.stability import allow
+from hapticdb.devices.stability import limit_stiffness
 from hapticdb.errors import UsageError
 from hapticdb.session.coupling import Coupling
 
@@ -38,10 +38,10 @@ def test_a_profile_that_is_given_takes_the_place_of_the_device_s() -> None:
 
 def test_the_stiffness_is_lowered_to_what_stays_stable_and_the_line_says_so() -> None:
     found = Coupling(stiffness=650.0).settled(OMNI, 1000.0, 1.0, 0.1)
-    allowed = allow(OMNI, 1000.0, 650.0)
+    allowed = limit_stiffness(OMNI, 1000.0, 650.0)
     assert found.stiffness == allowed.stiffness < 650.0
     assert found.lowered == allowed.lowered is not None
-    assert found.asked_stiffness == 650.0
+    assert found.requested_stiffness == 650.0
     assert found.turn_stiffness == pytest.approx(found.stiffness * 0.1**2)
 
 

@@ -143,7 +143,7 @@ def test_a_hand_that_does_not_know_its_place_at_once_is_asked_again(run: Run) ->
 def test_a_hand_that_never_knows_its_place_is_an_error(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.05)
+    monkeypatch.setattr(subject, "WARM_TIMEOUT", 0.05)
     with pytest.raises(DeviceError, match=r"has not said where it is within 0.05 s.*calibration$"):
         run(Lost(still(0.010), 1 << 30, 0.0))
 
@@ -153,7 +153,7 @@ def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: R
     hand = Odd(still(0.010), lambda r: r._replace(velocity=nowhere), first=60, n_reads=50)
     hand.over_after = 250
     answer, counts, frames = run(hand, seconds=60.0)
-    assert counts["nowhere_frames"] == 50
+    assert counts["invalid_frames"] == 50
     assert str(answer.bad_reading).startswith("Odd.read() returned numbers that are not finite")
     assert np.isfinite(frames["tool"]).all()
     forces = np.linalg.norm(frames["applied"][:, :3], axis=1)
@@ -162,7 +162,7 @@ def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: R
 
 
 def test_a_start_without_cells_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)
+    monkeypatch.setattr(subject, "WARM_TIMEOUT", 0.0)
     assert not run(still(0.03)).answer.is_warm
 
 

@@ -83,7 +83,7 @@ def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> It
     monkeypatch.setattr(
         subject, "parent_is_gone", lambda _=0.0: False
     )  # standard input may be closed
-    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no prefetch process exists
+    monkeypatch.setattr(subject, "WARM_TIMEOUT", 0.0)  # no prefetch process exists
     before = signal.getsignal(signal.SIGTERM)
     made = World(has_distances=request.param == "distance")
     yield made

@@ -9,7 +9,7 @@ import pytest
 
 import hapticdb
 from banded import write_points
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import Coupling, Environment, Grid, Handle, PointShell
 from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
@@ -49,7 +49,7 @@ def record(
         env.url, shell, hand or sliding(0.010), law=law, rendering=rendering, rate=RATE,
         record=path, staleness=NEVER_STALE, has_baseline=False, **options,  # type: ignore[arg-type]
     ) as session:  # fmt: skip
-        assert session.wait(PATIENCE) is not None
+        assert session.wait(TIMEOUT) is not None
     frames = recorded(path)
     assert frames["contacts"].any()
     return frames
@@ -184,7 +184,7 @@ def test_a_large_tool_a_filter_and_a_new_coupling_replay_bit_for_bit(
         cells, standing_plate(), sliding(-0.001), rate=RATE, record=path, staleness=NEVER_STALE,
         coupling=coupling, has_baseline=False,
     ) as session:  # fmt: skip
-        assert session.wait(PATIENCE) is not None
+        assert session.wait(TIMEOUT) is not None
     frames = recorded(path)
     assert frames["contacts"].any()
     assert (frames["spring"][:, 2] == 2.0).all()

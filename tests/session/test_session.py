@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numba import typeof
 
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import Environment, PointShell
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
 from hapticdb.kernels.period.loop import _layout_of
@@ -74,7 +74,7 @@ def play(cells: ResidentCells, shell: PointShell, path: Path, law: LawName) -> P
         cells, shell, stroking(0.010), law=law, rate=RATE, record=path, staleness=NEVER_STALE
     ) as session:
         pid = session.pid
-        report = session.wait(PATIENCE)
+        report = session.wait(TIMEOUT)
     assert report is not None
     recording = Recording(path)
     return Played(report, recorded(path), recording, pid)
@@ -144,7 +144,7 @@ def test_a_session_is_waited_for_in_steps_and_stopped(
         until(lambda: session.objects == (1,), session)
         report = session.stop()
         assert report.loop.frames >= 100
-        assert session.wait(PATIENCE) == session.stop()  # the same report again
+        assert session.wait(TIMEOUT) == session.stop()  # the same report again
     for closed in (session.stop, session.wait, session.last):
         with pytest.raises(UsageError, match="the session is closed"):
             closed()
@@ -161,13 +161,13 @@ def test_a_loop_that_is_killed_is_one_clear_error(
         until(lambda: session.n_frames > 50, session)
         os.kill(session.pid, how)
         with pytest.raises(HapticDBError, match="ended from outside") as raised:
-            session.wait(PATIENCE)
+            session.wait(TIMEOUT)
     assert "\n" not in str(raised.value)
     assert len(recorded(path)) > 50
     with Session(
         cells, sphere, still(0.010), law="plane", rate=RATE, seconds=0.1, staleness=NEVER_STALE
     ) as session:
-        report = session.wait(PATIENCE)  # the cells are still usable
+        report = session.wait(TIMEOUT)  # the cells are still usable
     assert report is not None
     assert report.hit_frames == report.loop.frames
 
@@ -192,7 +192,7 @@ def test_a_hand_that_fails_ends_the_session_with_its_error(
     hand = Unplugged(still(0.010), 200, kind)
     with Session(cells, sphere, hand, law="plane", rate=RATE) as session:
         with pytest.raises(HapticDBError, match=message):
-            session.wait(PATIENCE)
+            session.wait(TIMEOUT)
         pid = session.pid
     assert not is_alive(pid)
 
@@ -269,7 +269,7 @@ def test_a_users_law_with_an_array_behind_a_short_number_is_felt(
         cells, sphere, still(0.010), law=users_law.Table(), rendering="direct", rate=RATE,
         seconds=0.2, has_baseline=False,
     ) as session:  # fmt: skip
-        report = session.wait(PATIENCE)
+        report = session.wait(TIMEOUT)
     assert report is not None
     assert report.contact_frames == report.loop.frames > 0
 

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticdb.kernels import law as kernels
+from hapticdb.kernels import force_law as kernels
 
 
 class Numbers(NamedTuple):

@@ -11,13 +11,13 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.kernels.law import TangentPlaneLaw
+from hapticdb.kernels.force_law import TangentPlaneLaw
 from hapticdb.kernels.records.cells import MISSED
 from hapticdb.kernels.records.hand import RESULT
-from hapticdb.kernels.resident.cells import Cells, Place
-from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.cell_frames import evaluate_frames
+from hapticdb.kernels.resident.cells import CellGrid, Cells
 from hapticdb.paper.cost_model import CostModel, machine_name
-from hapticdb.resident.held import clusters_of
+from hapticdb.resident.point_runs import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store
 from naive import Voxel
@@ -134,16 +134,16 @@ class Reader:
     def __init__(self, table: CellTable, grid: Grid, shell: PointShell) -> None:
         self.table = table
         self.cells: Cells = table.cells
-        self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
+        self.place = CellGrid(*grid.origin, grid.voxel_size, float(grid.side))
         self.clusters = clusters_of(shell, grid.voxel_size)
         self.row = table.join()
         self.hits = np.empty(len(shell), dtype=np.int64)
         self.missed = np.zeros((), MISSED)
         self.out = np.zeros(1, RESULT)
 
-    def feel(self, pose: NDArray[np.float64]) -> tuple[list[int], bytes, int]:
+    def evaluate(self, pose: NDArray[np.float64]) -> tuple[list[int], bytes, int]:
         """Hits, wrench and number of unknown points."""
-        feel_kernel(
+        evaluate_frames(
             self.cells, self.row, self.clusters, pose[None], self.place,
             TangentPlaneLaw(1000.0), self.hits, self.missed, self.out,
         )  # fmt: skip

@@ -17,7 +17,7 @@ from command_line import Run, refused, succeeded
 from files_in_use import killed, make, write
 from hapticdb import backup_environment
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 
 
 def names(path: Path) -> list[str]:
@@ -66,7 +66,7 @@ def test_a_copy_beside_a_writer_in_another_process_is_a_revision_of_it(
 ) -> None:
     script = (
         "import sys\n"
-        "from hapticdb.store.sqlite.store import SQLiteStore\n"
+        "from hapticdb.store.sqlite.sqlite_store import SQLiteStore\n"
         "from voxels import blob, write_voxels\n"
         "store = SQLiteStore.open(sys.argv[1])\n"
         "for n in range(10**6):\n"

@@ -14,7 +14,7 @@ from psycopg import sql
 import hapticdb
 from assemblies import row_of_boxes
 from hapticdb.check import check_environment, repair_environment
-from hapticdb.clashes.run import accept_clash, find_clashes
+from hapticdb.clashes.search import accept_clash, find_clashes
 from hapticdb.store.postgres.address import parse
 from postgres_servers import Binaries
 from servers import FOUND, named, url_on

@@ -15,14 +15,14 @@ import pytest
 
 import hapticdb
 from assemblies import placement
-from children import PATIENCE, child, descendants, joined, until
+from children import TIMEOUT, child, descendants, joined, until
 from command_line import command, tool
 from crashes import EDITS, N_PARTS, PLACE, After, felt, small
 from hapticdb import Environment, PointShell
 from hapticdb.errors import ConnectionLostError, StuckError
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.postgres.connecting import link
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 from postgres_servers import Server
 from servers import Place
 from validity import Contents, assert_valid, contents
@@ -269,7 +269,7 @@ def test_an_interrupted_touch_leaves_nothing_behind(
         for _ in range(5):
             touching.stdout.readline()
         touching.send_signal(signal.SIGINT)
-        _, err = touching.communicate(timeout=PATIENCE)
+        _, err = touching.communicate(timeout=TIMEOUT)
     assert touching.returncode == 130, err
     assert err == "hapticdb: interrupted\n"
     left = (

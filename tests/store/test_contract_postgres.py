@@ -12,13 +12,13 @@ import pytest
 from psycopg import conninfo
 
 import hapticdb
-from children import PATIENCE
+from children import TIMEOUT
 from contract.store import StoreContract
 from hapticdb import Grid
 from hapticdb.errors import DatabaseError
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.postgres_store import PostgresStore
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.server_tables import SERVER_RESOLUTION
 from servers import Place
@@ -106,11 +106,11 @@ def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
         store = PostgresStore.open(where)
         with store.loading():
             write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
-            barrier.wait(PATIENCE)
+            barrier.wait(TIMEOUT)
         store.close()
 
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(load, range(2), timeout=PATIENCE))
+        list(pool.map(load, range(2), timeout=TIMEOUT))
     store = PostgresStore.open(where)
     assert len(store.objects()) == 2
     # no advisory lock of a loader remains, so that the next killed import can be repaired

@@ -18,10 +18,10 @@ from children import child, exit_code, finished
 from contract.store import StoreContract
 from files_in_use import GRID, make
 from hapticdb.store.connect import backup_environment
-from hapticdb.store.refusals import FORMAT
-from hapticdb.store.sqlite import place
-from hapticdb.store.sqlite.file import BEFORE_FORMAT_1, named_errors
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite import opened_file
+from hapticdb.store.sqlite.database_file import BEFORE_FORMAT_1, named_errors
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
+from hapticdb.store.store_errors import FORMAT
 from voxels import blob, with_distances, write_voxels
 
 ALL_KEYS = np.array([0]), np.array([1 << 9])
@@ -130,7 +130,7 @@ def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: P
 
 
 def test_an_immutable_reader_notices_a_writer(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hapticdb.store.sqlite.file.needs_immutable", lambda _: True)
+    monkeypatch.setattr("hapticdb.store.sqlite.database_file.needs_immutable", lambda _: True)
     reader = SQLiteStore.open(path, read_only=True)
     monkeypatch.undo()
     assert len(reader.objects()) == 1
@@ -143,7 +143,7 @@ def test_an_immutable_reader_notices_a_writer(path: Path, monkeypatch: pytest.Mo
 def test_a_database_in_use_is_told_after_a_while(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticdb.store.sqlite.file.BUSY_TIMEOUT_MS", 50)
+    monkeypatch.setattr("hapticdb.store.sqlite.database_file.BUSY_TIMEOUT_MS", 50)
     first, second = SQLiteStore.open(path), SQLiteStore.open(path)
     with (
         first._connection.writing(),
@@ -232,7 +232,7 @@ def test_a_read_only_copy_with_an_empty_log_is_read_and_a_full_log_told(
 def test_loading_fills_the_pages_and_readers_go_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(place, "LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(opened_file, "CHECK_SECONDS", 0.0)
     rng = np.random.default_rng(1)
     parts = [np.unique(rng.integers(0, 64, (200, 3)), axis=0) for _ in range(30)]
     fold = "PRAGMA wal_checkpoint(TRUNCATE)"

@@ -59,8 +59,10 @@ def answers(path: Path) -> str:
             for strategy in strategies:
                 touch = env.touch(shell, pose, strategy, law="plane")
                 told.append((touch.force.tolist(), touch.torque.tolist(), touch.pairs.tolist()))
-        with env.feeler(shell, jobs=1) as feeler:  # the distance law where there are distances
-            told.append(feeler.touch(poses).forces.tolist())
+        with env.batch_tool(
+            shell, jobs=1
+        ) as batch_tool:  # the distance law where there are distances
+            told.append(batch_tool.touch(poses).forces.tolist())
     return json.dumps(told)
 
 

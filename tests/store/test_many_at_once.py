@@ -20,7 +20,7 @@ import pytest
 
 import hapticdb
 from assemblies import ball, box, placement, small_options, write_obj
-from children import PATIENCE, end_forked, joined, received, until
+from children import TIMEOUT, end_forked, joined, received, until
 from hapticdb import Environment, PointShell
 from hapticdb.cli import main
 from hapticdb.errors import StuckError
@@ -115,7 +115,7 @@ def processes(
     finally:
         for process in made:
             process.kill()
-            process.join(PATIENCE)
+            process.join(TIMEOUT)
 
 
 def places_of(env: Environment) -> list[tuple[Object, Rows]]:
@@ -163,7 +163,7 @@ def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder
         importer.start()
         n_moves = 0
         waiting = list(children)
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT
         while importer.is_alive() or waiting:
             assert time.monotonic() < deadline
             assert all(child.is_alive() for child in children)
@@ -178,7 +178,7 @@ def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder
             ours.send("stop")
         for (ours, _), child in zip(pipes, children, strict=True):
             assert [received(ours), received(ours)] == ["seen", "done"]
-            child.join(PATIENCE)
+            child.join(TIMEOUT)
             assert child.exitcode == 0
         assert_valid(env)
         assert env.store.revision() == 1 + n_moves + N_IMPORTS * 2 * 8
@@ -232,7 +232,7 @@ def test_translations_of_two_writers_both_count(url: str) -> None:
     n_each, step = 3, "0.001,0,0"
     with processes(shift, *((url, step, n_each) for _ in range(2))) as writers:
         for writer in writers:
-            writer.join(PATIENCE)
+            writer.join(TIMEOUT)
         assert [writer.exitcode for writer in writers] == [0, 0]
     with hapticdb.open(url) as env:
         assert env.object(1).transform[0, 3] == pytest.approx(0.001 * 2 * n_each)

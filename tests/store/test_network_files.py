@@ -8,8 +8,8 @@ import pytest
 from command_line import Run, refused, succeeded
 from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
-from hapticdb.store.sqlite import file as sqlite_file
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite import database_file as sqlite_file
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 from voxels import blob, write_voxels
 
 GRID = Grid(0.01, (0.0, 0.0, 0.0), 6)

@@ -20,10 +20,10 @@ from hapticdb.errors import AccessError, ConnectionLostError, EnvironmentExistsE
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Columns, Layout
 from hapticdb.store.connect import grant
-from hapticdb.store.postgres import schema_of
+from hapticdb.store.postgres import environment_schema
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.partitions import ends
-from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.postgres_store import PostgresStore
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.server_tables import ServerTables
 from hapticdb.store.urls import redact, with_partitions
@@ -54,8 +54,8 @@ def spread(template: tuple[Path, Binaries]) -> Iterator[Spread]:
 
 
 def dropped(url: str) -> None:
-    with schema_of.connected(url) as connection:
-        schema_of.drop(connection)
+    with environment_schema.connected(url) as connection:
+        environment_schema.drop(connection)
 
 
 @pytest.fixture
@@ -102,8 +102,8 @@ def test_frames_are_those_of_one_server(
             assert found == [felt(one, shell, pose, strategy) for pose in poses]
             assert any(len(hits) for _, hits, _ in found)
         if layout == "brick":
-            cells = env.feeler(shell), one.feeler(shell)
-            both = [feeler.touch(np.array(poses)).forces.tobytes() for feeler in cells]
+            cells = env.batch_tool(shell), one.batch_tool(shell)
+            both = [batch_tool.touch(np.array(poses)).forces.tobytes() for batch_tool in cells]
             assert both[0] == both[1]
     dropped(url)
 
@@ -135,15 +135,17 @@ def test_keys_and_ranges_reach_only_the_partitions_that_have_them(made: str) -> 
         keys = env.store.scan(np.array([0]), np.array([first - 1])).keys[:3]
     asked: tuple[Columns, ...] = "brick", "distances"
     for columns in asked:
-        text = plan(made, statements.SPREAD.lookup[columns], wire.int8s(keys))
+        text = plan(made, statements.PARTITIONED.lookup[columns], wire.int8s(keys))
         assert all("(z_val = ANY (" in sent for sent in remote(text))
         assert len(remote(text)) == 1
         lows, highs = np.array([3, second + 2]), np.array([first - 2, second + 9])
-        text = plan(made, statements.SPREAD.scan[columns], wire.int8s(lows), wire.int8s(highs))
+        text = plan(made, statements.PARTITIONED.scan[columns], wire.int8s(lows), wire.int8s(highs))
         assert len(remote(text)) == 2
         assert all("z_val >= $1" in sent and "z_val <= $2" in sent for sent in remote(text))
     everywhere = wire.int8s(np.array([1, first + 1, second + 1]))
-    assert plan(made, statements.SPREAD.lookup["brick"], everywhere).count("Async Foreign") == 3
+    assert (
+        plan(made, statements.PARTITIONED.lookup["brick"], everywhere).count("Async Foreign") == 3
+    )
 
 
 def test_what_a_crash_has_left_is_not_felt_and_is_mended(

@@ -13,7 +13,7 @@ import pytest
 import hapticdb
 from children import finished
 from files_in_use import make, write
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 
 EVERYWHERE = [(0, 2**62)]
 
@@ -85,7 +85,7 @@ def test_a_reader_never_feels_commits_into_another_file(
     path: Path, sphere: hapticdb.PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A store that opens the new file shares the log with the reader, which fails at once."""
-    monkeypatch.setattr("hapticdb.store.sqlite.place.LOOK_SECONDS", 1e6)
+    monkeypatch.setattr("hapticdb.store.sqlite.opened_file.CHECK_SECONDS", 1e6)
     with hapticdb.open(path, read_only=True) as env:
         env.touch(sphere, np.eye(4))
         replaced(path)

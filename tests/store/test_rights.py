@@ -32,7 +32,7 @@ from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.connect import grant
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.postgres_store import PostgresStore
 from hapticdb.store.urls import redact
 from hapticdb.transfer import copy_environment
 from postgres_servers import Server, serving

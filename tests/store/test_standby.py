@@ -20,7 +20,7 @@ from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.session.prefetch.fetching import Fetcher, FetchRequest
 from hapticdb.store.engines import MayLag
-from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.postgres_store import PostgresStore
 from postgres_servers import Server, serving
 from servers import FOUND, SETTINGS, named
 from voxels import is_noticed, write_voxels

@@ -13,17 +13,17 @@ from psycopg import sql
 from psycopg.pq.abc import PGresult
 
 import hapticdb
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import Grid
 from hapticdb.store.connect import create_store
 from hapticdb.store.postgres import watching
 from hapticdb.store.postgres.address import LONGEST_NAME, parse
-from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.schema_of import drop
-from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.connecting.server_connection import ServerConnection
+from hapticdb.store.postgres.environment_schema import drop
+from hapticdb.store.postgres.postgres_store import PostgresStore
 from hapticdb.store.postgres.watching import channel_of
-from hapticdb.store.sqlite import place as sqlite_place
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite import opened_file as sqlite_place
+from hapticdb.store.sqlite.sqlite_store import SQLiteStore
 from servers import Place, roles
 from voxels import is_noticed, write_voxels
 
@@ -58,7 +58,7 @@ def write(where: str) -> None:
 def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
     file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_replaced: bool
 ) -> None:
-    monkeypatch.setattr(sqlite_place, "LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(sqlite_place, "CHECK_SECONDS", 0.0)
     reader = SQLiteStore.open(file, read_only=True)
     reader.watch()
     assert not reader.has_changed()
@@ -89,20 +89,20 @@ def reader(url: str) -> Iterator[PostgresStore]:
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A list that gets one entry for each round trip that asks for the revision."""
     found: list[int] = []
-    ask = watching.Watch._ask
+    ask = watching.Watch._query_revision
 
     def counted(watch: watching.Watch) -> None:
         found.append(1)
         ask(watch)
 
-    monkeypatch.setattr(watching.Watch, "_ask", counted)
+    monkeypatch.setattr(watching.Watch, "_query_revision", counted)
     return found
 
 
 def test_a_reader_that_lost_its_connection_listens_again(
     url: str, reader: PostgresStore, admin: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    monkeypatch.setattr(watching, "LISTENING_S", 1e9)
     for is_used_meanwhile in (False, True):
         reader.watch()
         pid = reader._connection.driver.info.backend_pid
@@ -138,7 +138,7 @@ def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
         return command(connection, text)
 
     monkeypatch.setattr(ServerConnection, "command", refuse)
-    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    monkeypatch.setattr(watching, "LISTENING_S", 1e9)
     reader = PostgresStore.open(url, read_only=True)
     reader.watch()
     for _ in range(2):
@@ -173,7 +173,7 @@ def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.
     admin.execute(sql.SQL("LISTEN {}").format(sql.Identifier(channel)))
     write(url)
     write(url)
-    heard = admin.notifies(timeout=PATIENCE, stop_after=2)
+    heard = admin.notifies(timeout=TIMEOUT, stop_after=2)
     assert [(n.channel, n.payload) for n in heard] == [(channel, "1"), (channel, "2")]
 
 
@@ -206,7 +206,7 @@ def test_words_of_strangers_on_the_channel_hide_no_edit(
     url: str, reader: PostgresStore, stranger: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each edit is noticed by its own notification, as without forged ones."""
-    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    monkeypatch.setattr(watching, "LISTENING_S", 1e9)
     channel = channel_of(parse(url).environment)
     with pytest.raises(psycopg.errors.InsufficientPrivilege):
         stranger.execute(sql.SQL("SELECT * FROM {}.change").format(sql.Identifier(channel[9:])))

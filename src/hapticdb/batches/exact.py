@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.batches.batch_results import ClearanceBatch
 from hapticdb.batches.order import not_rigid
-from hapticdb.batches.result import ClearanceBatch
 from hapticdb.errors import UsageError
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.rigid import first_not_rigid
-from hapticdb.kernels.surfaces.sides import TriangleTree
-from hapticdb.kernels.triangles.nearest import nearest
-from hapticdb.pointshell.moving import MovingSurface
-from hapticdb.pointshell.shape import tree_of
+from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH
+from hapticdb.kernels.triangles.surface_distance import nearest
+from hapticdb.pointshell.shape import bvh_of
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.store.base import Object, Store
 
 Floats = NDArray[np.float64]
@@ -44,12 +44,12 @@ def least_distance(store: Store, ones: Sequence[Object], others: Sequence[Object
     boxes, more = (np.array([obj.bounds for obj in some]) for some in (ones, others))
     apart = np.maximum(boxes[:, None, 0] - more[None, :, 1], more[None, :, 0] - boxes[:, None, 1])
     gaps = np.linalg.norm(np.maximum(apart, 0.0), axis=2)
-    trees: dict[int, tuple[TriangleTree, float]] = {}
+    trees: dict[int, tuple[TriangleBVH, float]] = {}
 
-    def tree_and_chord(obj: Object) -> tuple[TriangleTree, float]:
+    def tree_and_chord(obj: Object) -> tuple[TriangleBVH, float]:
         if obj.id not in trees:
             ((_, part),) = parts_of(store, [obj])
-            trees[obj.id] = tree_of(part.surface()), part.placed_chord
+            trees[obj.id] = bvh_of(part.surface()), part.placed_chord
         return trees[obj.id]
 
     found, least_of_all, limit = None, np.inf, np.inf
@@ -87,7 +87,7 @@ def exact_clearance(
     first = first_not_rigid(poses)
     if first < len(poses):
         raise not_rigid(first)
-    tool = MovingSurface(shell)
+    tool = ToolSurface(shell)
     found = ClearanceBatch(len(poses), reach)
     places = np.zeros((len(poses), 3))
     found.revision = store.revision()
@@ -99,7 +99,7 @@ def exact_clearance(
         farthest = np.minimum(found.distances, reach)
         near = np.flatnonzero(gaps[i] < farthest)
         if len(near):
-            tree = tree_of(part.surface())
+            tree = bvh_of(part.surface())
             measured = tool.nearest(tree, poses[near], farthest[near])
             is_nearer = measured.pairs[:, 0] >= 0
             at = near[is_nearer]

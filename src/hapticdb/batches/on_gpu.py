@@ -8,15 +8,15 @@ import numpy as np
 from numba import config, cuda
 from numpy.typing import NDArray
 
-from hapticdb.batches.nearest import NearestSearch
+from hapticdb.batches.batch_results import TouchBatch
+from hapticdb.batches.batch_threads import BatchThreads
 from hapticdb.batches.order import not_rigid, order_of
-from hapticdb.batches.result import TouchBatch
-from hapticdb.batches.threads import BatchThreads
+from hapticdb.batches.voxel_distances import NearestSearch
 from hapticdb.errors import MissingExtraError, pip_line
 from hapticdb.kernels import rigid
-from hapticdb.kernels.gpu import frames as kernels
-from hapticdb.kernels.gpu import nearest as searches
-from hapticdb.kernels.gpu.frames import RESULTS
+from hapticdb.kernels.gpu import gpu_frames as kernels
+from hapticdb.kernels.gpu import gpu_nearest as searches
+from hapticdb.kernels.gpu.gpu_frames import RESULTS
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.mirror import CellMirror
 
@@ -150,7 +150,7 @@ class GpuFrames:
         """End the threads."""
         self._copiers.shutdown()
 
-    def feel(self, pose: Floats) -> Floats:
+    def evaluate(self, pose: Floats) -> Floats:
         """Results (RESULTS,) of a frame at a rigid pose (4, 4), else UsageError, in resident cells.
 
         The pose is an argument of the launch, and the results are in mapped memory: a tenth of the
@@ -160,19 +160,19 @@ class GpuFrames:
             raise not_rigid(0)
         self.mirror.update()
         self._one(
-            self._frames.law, self._frames.residency.place, self._shell,
+            self._frames.law, self._frames.residency.cell_grid, self._shell,
             tuple(pose[:3].ravel().tolist()), *self.mirror.arrays, self._sums, self._end, self._out,
         )  # fmt: skip
         self._stream.synchronize()
         return np.array(self._out)
 
     def touch(
-        self, poses: Floats, felt: TouchBatch, progress: Callable[[int, int], None] | None
+        self, poses: Floats, results: TouchBatch, progress: Callable[[int, int], None] | None
     ) -> None:
-        """Results at poses (B, 4, 4), into `felt`; poses with all cells resident come first."""
+        """Results at poses (B, 4, 4), into `results`; poses with all cells resident come first."""
         pending: list[NDArray[np.int64]] = []
         for part, found in self.run(poses):
-            self._put(felt, part, found)
+            self._put(results, part, found)
             pending.append(part.start + np.flatnonzero(found.unknown > 0.0))
             if progress is not None:
                 progress(part.stop, len(poses))
@@ -184,7 +184,7 @@ class GpuFrames:
             ready = left[: self._frames.fetch(poses[left])]
             left = left[len(ready) :]
             for part, found in self.run(poses[ready]):
-                self._put(felt, ready[part], found)
+                self._put(results, ready[part], found)
 
     def run(self, poses: Floats) -> Iterator[tuple[slice, RawFrames]]:
         """Results of rigid poses (B, 4, 4), else UsageError, piece by piece, in resident cells."""
@@ -225,8 +225,8 @@ class GpuFrames:
                 cuda.device_array(part.stop - start, np.int64),
             )
             search[min(part.stop - start, MOST_BLOCKS), searches.THREADS](
-                self._frames.residency.place, self._shell, cuda.to_device(poses[part]), seen, reach,
-                *found,
+                self._frames.residency.cell_grid, self._shell, cuda.to_device(poses[part]), seen,
+                reach, *found,
             )  # fmt: skip
             squares[part], points[part] = (one.copy_to_host() for one in found)
         return squares, points
@@ -234,8 +234,8 @@ class GpuFrames:
     def _launch(self, stream: Any, poses: Any, sums: Any, ended: Any, out: Any) -> None:  # noqa: ANN401 - numba's
         blocks = min(len(poses) * self._shares, MOST_BLOCKS)
         self._kernel[blocks, self._threads, stream](
-            self._frames.law, self._frames.residency.place, self._shell, poses, *self.mirror.arrays,
-            sums, ended, out,
+            self._frames.law, self._frames.residency.cell_grid, self._shell, poses,
+            *self.mirror.arrays, sums, ended, out,
         )  # fmt: skip
 
     @staticmethod
@@ -249,7 +249,7 @@ class GpuFrames:
         """Copy poses (n, 4, 4) to the front of `to`."""
         self._divide(len(poses), lambda part: np.copyto(to[part], poses[part]))
 
-    def _put(self, felt: TouchBatch, at: slice | NDArray[np.int64], found: RawFrames) -> None:
+    def _put(self, results: TouchBatch, at: slice | NDArray[np.int64], found: RawFrames) -> None:
         """Store results in a batch, at the indices of its poses."""
 
         def put(part: slice) -> None:
@@ -258,9 +258,9 @@ class GpuFrames:
                 if isinstance(at, slice)
                 else at[part]
             )
-            felt.forces[to], felt.torques[to] = found.forces[part], found.torques[part]
-            felt.hits[to], felt.n_contacts[to] = found.hits[part], found.contacts[part]
-            felt.deepest[to] = found.deepest[part]
+            results.forces[to], results.torques[to] = found.forces[part], found.torques[part]
+            results.hits[to], results.n_contacts[to] = found.hits[part], found.contacts[part]
+            results.deepest[to] = found.deepest[part]
 
         self._divide(len(found.hits), put)
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.result import Clash, gravity
-from hapticdb.exact.shapes import relative_poses
+from hapticdb.clashes.clash_results import Clash, gravity
+from hapticdb.exact.shape_cache import relative_poses
 from hapticdb.store.base import Object, Store
 from hapticdb.units import length_text, volume_text
 from hapticdb.verdicts import Kind
@@ -91,7 +91,7 @@ def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
     object with most others in one kind takes its pairs, down to `MANY`. Each other pair is a group.
     Duplicates at one place are a group. pairs : the gravest first.
     """
-    there = [one for one in pairs if one.status != "gone" and not one.is_left]
+    there = [one for one in pairs if one.status != "gone" and not one.is_unmeasured]
     objects = {obj.id: obj for obj in store.objects({i for one in there for i in one[:2]})}
     there = [one for one in there if one.a in objects and one.b in objects]
     alike: dict[str, list[Clash]] = {}
@@ -127,22 +127,22 @@ def _one_against_many(
     """
     shapes = sorted(objects.values(), key=lambda obj: (obj.digest, obj.name, obj.id))
     rank = {obj.id: n for n, obj in enumerate(shapes)}
-    met: dict[tuple[Kind, int], dict[int, Clash]] = {}
+    partners: dict[tuple[Kind, int], dict[int, Clash]] = {}
     for one in pairs:
-        met.setdefault((one.kind, one.a), {})[one.b] = one
-        met.setdefault((one.kind, one.b), {})[one.a] = one
-    most = [(-len(others), rank[key[1]], key) for key, others in met.items()]
+        partners.setdefault((one.kind, one.a), {})[one.b] = one
+        partners.setdefault((one.kind, one.b), {})[one.a] = one
+    most = [(-len(others), rank[key[1]], key) for key, others in partners.items()]
     heapify(most)
     while most:
         n, rank_of, key = heappop(most)
-        others = met[key]
+        others = partners[key]
         if len(others) < MANY:
             continue
         if len(others) < -n:  # others have taken pairs since
             heappush(most, (-len(others), rank_of, key))
             continue
         for other in others:
-            del met[key[0], other][key[1]]
+            del partners[key[0], other][key[1]]
         yield key[1], list(others.values())
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hapticdb.clashes.result import Clashes
+from hapticdb.clashes.clash_results import Clashes
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh.part import Part
@@ -46,17 +46,17 @@ def with_volumes(store: Store, found: Clashes, least: float = 0.0) -> Clashes:
     def solid(digest: str) -> "Manifold | None":
         return _solid(next(parts_of(store, [solids[digest]]))[1])
 
-    told = []
+    measured = []
     for one in found.pairs:
         a, b = objects.get(one.a), objects.get(one.b)
         if one.kind == Kind.OVERLAPPING and a is not None and b is not None:
             volume = _common(a, b, solid(a.digest), solid(b.digest))
             if volume is not None and volume < least:
                 continue
-            told.append(one._replace(volume=volume))
+            measured.append(one._replace(volume=volume))
         else:
-            told.append(one)
-    return replace(found, told=tuple(told), rest=found.rest.none())
+            measured.append(one)
+    return replace(found, current=tuple(measured), rest=found.rest.none())
 
 
 def _common(a: Object, b: Object, one: "Manifold | None", other: "Manifold | None") -> float | None:

@@ -17,14 +17,14 @@ from hapticdb.cli import render
 from hapticdb.cli.options import command
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
 from hapticdb.cli.verbs.clashing import clashes
+from hapticdb.cli.verbs.copying import copy, diff
 from hapticdb.cli.verbs.editing import move, remove
 from hapticdb.cli.verbs.extracting import extract
 from hapticdb.cli.verbs.feeling import feel
 from hapticdb.cli.verbs.importing import import_
-from hapticdb.cli.verbs.keeping import backup, check, grant
 from hapticdb.cli.verbs.listing import info, objects
+from hapticdb.cli.verbs.maintenance import backup, check, grant
 from hapticdb.cli.verbs.measuring import distance
-from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample
 from hapticdb.cli.verbs.serving import serve, view

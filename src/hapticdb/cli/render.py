@@ -221,8 +221,8 @@ def shares(counts: Mapping[str, int]) -> str:
 @contextmanager
 def import_bar() -> "Iterator[ImportCallback | None]":
     """Progress bar of the imported parts of a file; see `bar`."""
-    with bar("importing", "parts") as tell:
-        yield tell and (lambda now: tell(now.parts_done + now.share, now.parts_total))
+    with bar("importing", "parts") as update:
+        yield update and (lambda now: update(now.parts_done + now.share, now.parts_total))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ BETWEEN = ";"
 _HINT = "give a header with part or tool, and path; and if wanted where, exclude, contact"
 
 
-class Asked(NamedTuple):
+class ListedSweep(NamedTuple):
     """Request for a sweep; contact : metres; line : of a file of sweeps, or empty."""
 
     tool: str | None
@@ -44,7 +44,7 @@ def naming(line: str) -> Iterator[None]:
         raise UsageError(f"{line}: {error}") from error
 
 
-def read_sweeps(path: str, given: Asked) -> list[Asked]:
+def read_sweeps(path: str, given: ListedSweep) -> list[ListedSweep]:
     """Sweeps of a CSV file, at least one; empty or missing cells have the values of `given`."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
@@ -57,15 +57,15 @@ def read_sweeps(path: str, given: Asked) -> list[Asked]:
         if unknown or "path" not in (reader.fieldnames or ()):
             which = f"no column {unknown[0][:40]!r} is known; " if unknown else ""
             raise FileError(f"--batch {path}: {which}{_HINT}")
-        asked = [_asked(row, given, f"{path}, line {reader.line_num}") for row in reader]
+        requests = [_request_of(row, given, f"{path}, line {reader.line_num}") for row in reader]
     except csv.Error as error:
         raise FileError(f"--batch {path}, line {reader.line_num}: {error}; {_HINT}") from error
-    if not asked:
+    if not requests:
         raise FileError(f"--batch {path}: no sweep after its header; {_HINT}")
-    return asked
+    return requests
 
 
-def _asked(row: dict[str, str | None], given: Asked, line: str) -> Asked:
+def _request_of(row: dict[str, str | None], given: ListedSweep, line: str) -> ListedSweep:
     """Sweep of a row."""
     if None in row or None in row.values():
         raise FileError(f"--batch {line}: it has more or fewer cells than the header")
@@ -73,7 +73,7 @@ def _asked(row: dict[str, str | None], given: Asked, line: str) -> Asked:
     tool, part, path = (cells.get(name, "") for name in ("tool", "part", "path"))
     if not path or bool(tool) == bool(part):
         raise FileError(f"--batch {line}: give a path, and one of tool and part")
-    return Asked(
+    return ListedSweep(
         tool or None, _words(part), path, _words(cells.get("where")) or given.where,
         _words(cells.get("exclude")) or given.exclude,
         _contact(cells.get("contact"), given.contact, line), line,

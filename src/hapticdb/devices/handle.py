@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.devices.protocol import Reading
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import UsageError
-from hapticdb.kernels.hand.handle import follow
+from hapticdb.kernels.hand.handle_motion import follow
 from hapticdb.kernels.records.hand import HANDLE
 from hapticdb.kernels.records.layout import pose_numbers
 from hapticdb.kernels.rigid import is_rigid

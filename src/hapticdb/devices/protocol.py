@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import DeviceError, UsageError
-from hapticdb.kernels.hand.handle import FARTHEST, is_somewhere
+from hapticdb.kernels.hand.handle_motion import FARTHEST, is_valid_pose
 
 SKEW = 1e-3
 """Greatest error of the dot products of a rotation's columns, 0 or 1 when exact. Rounding to single
@@ -139,7 +139,7 @@ class Reader:
         self._last = reading
         return reading if _is_rigid_enough(pose) else reading._replace(pose=self._nowhere)
 
-    def complaint(self) -> str:
+    def fault(self) -> str:
         """Fault of the last reading's numbers, in one line; empty without one."""
         last = self._last
         if last is None:
@@ -151,7 +151,7 @@ class Reader:
                 "a pose that is no rigid transform",
                 f"a rotation to {SKEW:g}, and a last row 0 0 0 1",
             )
-        if not is_somewhere(last.pose, last.velocity):
+        if not is_valid_pose(last.pose, last.velocity):
             return self._said(f"numbers beyond {FARTHEST:g}", "metres, m/s and rad/s")
         return ""
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import UsageError
-from hapticdb.kernels.motion import play, survey, sway
+from hapticdb.kernels.hand_motion import play, survey, sway
 from hapticdb.poses import quaternion_of, read_timed_poses
 
 Clock = Callable[[], float]
@@ -197,9 +197,9 @@ def _times_at(
     )
     turns = 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
     moves = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    ways = np.maximum(moves, LEVER * turns)
-    kept = np.concatenate([[True], ways > 1e-12])
-    return np.concatenate([[0.0], np.cumsum(ways[kept[1:]])]) / speed, poses[kept]
+    lengths = np.maximum(moves, LEVER * turns)
+    kept = np.concatenate([[True], lengths > 1e-12])
+    return np.concatenate([[0.0], np.cumsum(lengths[kept[1:]])]) / speed, poses[kept]
 
 
 class RandomHand(_Scripted):

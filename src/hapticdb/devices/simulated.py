@@ -18,8 +18,8 @@ from hapticdb.devices.protocol import (
 )
 from hapticdb.devices.scripted import Clock, capped
 from hapticdb.errors import UsageError
-from hapticdb.kernels.hand.handle import is_somewhere
-from hapticdb.kernels.motion import pull
+from hapticdb.kernels.hand.handle_motion import is_valid_pose
+from hapticdb.kernels.hand_motion import pull
 from hapticdb.poses import quaternion_of
 
 STEP = 1e-4
@@ -132,7 +132,7 @@ class SimulatedDevice:
         """
         hand = self._reader.read()
         now = self.clock()
-        if not is_somewhere(hand.pose, hand.velocity):
+        if not is_valid_pose(hand.pose, hand.velocity):
             if self._time is not None:
                 self._time = now
             return hand

@@ -29,7 +29,7 @@ class _Allowance:
 
     Attributes
     ----------
-    asked, stiffness : float
+    requested, stiffness : float
         Requested and granted stiffness, N/m.
     delay : float
         Delay in the stability rule, s.
@@ -37,7 +37,7 @@ class _Allowance:
         One line: the limit that lowered the stiffness; None if none did.
     """
 
-    asked: float
+    requested: float
     stiffness: float
     delay: float
     lowered: str | None
@@ -70,8 +70,8 @@ def stable_stiffness(profile: DeviceProfile, rate: float, delay: float) -> float
     return SHARE * (profile.own_damping + hand_damping(profile)) / (0.5 / rate + delay)
 
 
-def allow(
-    profile: DeviceProfile, rate: float, asked: float | None = None, delay: float | None = None
+def limit_stiffness(
+    profile: DeviceProfile, rate: float, requested: float | None = None, delay: float | None = None
 ) -> _Allowance:
     """Limit a stiffness to the device's greatest and to the stable one.
 
@@ -81,7 +81,7 @@ def allow(
         The device.
     rate : float
         Frames a second.
-    asked : float or None
+    requested : float or None
         Stiffness at the device, N/m. None: the profile's.
     delay : float or None
         Seconds; None: see `delay_of`.
@@ -91,7 +91,7 @@ def allow(
     UsageError
         If the stiffness is not a number of `SMALLEST` or more.
     """
-    wanted = profile.first_stiffness if asked is None else asked
+    wanted = profile.first_stiffness if requested is None else requested
     if not (math.isfinite(wanted) and wanted >= SMALLEST):
         raise UsageError(f"a stiffness of {wanted} N/m: give {SMALLEST:g} or more")
     late = delay_of(profile, rate, delay)

@@ -13,13 +13,13 @@ from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
 from hapticdb.ingest.geometry import shell_of_objects
 from hapticdb.ingest.layout import voxels_of_rows
-from hapticdb.ingest.moving import move_object, restore_object, shift_objects
+from hapticdb.ingest.object_moves import move_object, restore_object, shift_objects
 from hapticdb.mesh import read_file
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.figures import QueryFigures
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.frame import as_id
+from hapticdb.query.haptic_query import as_id
 from hapticdb.store.base import Layout, Object, Size, Store
 from hapticdb.store.covering import object_ranges
 from hapticdb.store.filtering import Filter
@@ -98,9 +98,9 @@ class Environment(Queries, Closes):
         """
         return find_objects(self, words)
 
-    def felt(self, where: Words = (), exclude: Words = ()) -> list[Object]:
+    def select(self, where: Words = (), exclude: Words = ()) -> list[Object]:
         """Objects selected by `where` and `exclude`, ordered by id; errors as for `touch`."""
-        return Filter(where, exclude).felt(self.objects(), self.url)
+        return Filter(where, exclude).select(self.objects(), self.url)
 
     def shell(
         self,
@@ -201,14 +201,14 @@ class Environment(Queries, Closes):
         self._forget()
         return self.object(object_id)
 
-    def shift(self, object_ids: Iterable[int], way: ArrayLike) -> list[Object]:
-        """Shift all objects by the vector `way` (3,), metres, world frame: all of them, or none.
+    def shift(self, object_ids: Iterable[int], translation: ArrayLike) -> list[Object]:
+        """Shift objects by `translation` (3,), metres, world frame: all of them, or none.
 
         One transaction: other writers wait meanwhile; readers do not. Raises `OutsideGridError` as
         for `move`.
         """
         self._check_writable()
-        shifted = shift_objects(self._store, object_ids, way)
+        shifted = shift_objects(self._store, object_ids, translation)
         self._forget()
         return shifted
 
@@ -240,7 +240,7 @@ class Environment(Queries, Closes):
     def _forget(self) -> None:
         """Drop the values cached before an edit of this environment."""
         self._figures.rows_changed()
-        self._query.known.forget()
+        self._query.known.invalidate()
 
     def _check_writable(self) -> None:
         if self._store.is_read_only:

@@ -13,7 +13,7 @@ from hapticdb.paper.figures import QueryFigures
 from hapticdb.paper.grouping import DEFAULT_MAXGAP
 from hapticdb.paper.strategies import Strategies, Strategy
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.frame import as_poses
+from hapticdb.query.haptic_query import as_poses
 from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law, inset_of
 from hapticdb.query.touches import Touch
 from hapticdb.store.base import Store
@@ -21,9 +21,9 @@ from hapticdb.store.filtering import ALL, NOTHING, Filter, FiltersOfWords
 from hapticdb.store.finding import Words, find_objects
 
 if TYPE_CHECKING:
+    from hapticdb.batches.batch_results import ClearanceBatch, TouchBatch
+    from hapticdb.batches.batch_tool import BatchDevice, BatchTool, PoseCallback
     from hapticdb.batches.exact import Distance
-    from hapticdb.batches.feeler import BatchDevice, Feeler, PoseCallback
-    from hapticdb.batches.result import ClearanceBatch, TouchBatch
 
 FilePath = str | os.PathLike[str]
 
@@ -130,7 +130,7 @@ class Queries:
         pose (4, 4) : world_from_tool, rigid, metres; returns a `Touch`
         poses (B, 4, 4) : many of them instead, for a `TouchBatch`, the same bit for bit, by all
             processors
-        objects, progress, device : for many poses, as for `Feeler.touch` and `feeler`
+        objects, progress, device : for many poses, as for `BatchTool.touch` and `batch_tool`
         strategy : for one pose, form of the query: ``statement``, ``array``, ``points``,
             ``maxgap``, ``cbgroup``, which all read the database, or ``auto``: decoded bricks stay
             in memory, and missing ones are read as by ``array``, or many as by ``cbgroup``. All
@@ -152,13 +152,15 @@ class Queries:
         if getattr(pose, "ndim", 2) == 3:
             raise UsageError("give a tool, then one pose, or many as poses=...")
         if pose is not None:
-            felt = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)
+            selection = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)
             chosen = as_law(law) if isinstance(law, str) else law
-            return self._strategies.touch(shell, pose, strategy, maxgap, felt, chosen)
+            return self._strategies.touch(shell, pose, strategy, maxgap, selection, chosen)
         if strategy != "auto":
             raise UsageError(f"strategy {strategy!r} for many poses: leave it out")
-        with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:
-            return feeler.touch(poses, objects=objects, progress=progress)  # type: ignore[arg-type]
+        with self.batch_tool(
+            shell, where=where, exclude=exclude, law=law, device=device
+        ) as batch_tool:
+            return batch_tool.touch(poses, objects=objects, progress=progress)  # type: ignore[arg-type]
 
     def touch_pieces(
         self,
@@ -177,25 +179,31 @@ class Queries:
         on : ``cpu``, ``cuda``, or a scheduler of dask.distributed, ``tcp://host:8786``. Its workers
             reach the environment by the URL that opened it. Results are the same, bit for bit.
         """
-        from hapticdb.batches import feeler as feeling  # noqa: PLC0415 - loads numba
-        from hapticdb.cluster.place import Whereabouts  # noqa: PLC0415
-        from hapticdb.cluster.workers import connected  # noqa: PLC0415
+        from hapticdb.batches import batch_tool as batch_tools  # noqa: PLC0415 - loads numba
+        from hapticdb.cluster.environment_address import EnvironmentAddress  # noqa: PLC0415
+        from hapticdb.cluster.scheduler import connected  # noqa: PLC0415
 
         def pieces(size: int) -> Iterator[NDArray[np.float64]]:
             return (np.asarray(poses[at : at + size]) for at in range(0, len(poses), size))
 
         if "://" not in on:
             device = cast("BatchDevice", on)
-            with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:
-                yield from map(feeler.touch, pieces(feeling.PIECE))
+            with self.batch_tool(
+                shell, where=where, exclude=exclude, law=law, device=device
+            ) as batch_tool:
+                yield from map(batch_tool.touch, pieces(batch_tools.PIECE))
             return
-        felt, chosen = self._filters.of(where, exclude), self._query.law_now(as_law(law))
+        selection, chosen = self._filters.of(where, exclude), self._query.law_now(as_law(law))
         with connected(on) as workers:
             assert workers is not None  # noqa: S101 - there is an address
             work = partial(
-                feeling.touch_at, Whereabouts.of(self._store, self.address), shell, felt, chosen
+                batch_tools.touch_at,
+                EnvironmentAddress.of(self._store, self.address),
+                shell,
+                selection,
+                chosen,
             )
-            yield from workers.each(work, pieces(feeling.TASK))
+            yield from workers.each(work, pieces(batch_tools.TASK))
 
     def collides(
         self,
@@ -213,7 +221,7 @@ class Queries:
         By the shell's points, which may miss what is thinner than they are apart. With `exact`
         whether its surface meets that of an object, as for `clearance`.
 
-        Arguments as for `touch`, `feeler` and `Feeler.touch`; errors as for `touch`.
+        Arguments as for `touch`, `batch_tool` and `BatchTool.touch`; errors as for `touch`.
         """
         if exact:
             from hapticdb.batches.exact import MET  # noqa: PLC0415 - loads kernels
@@ -224,8 +232,10 @@ class Queries:
             ).is_beyond  # fmt: skip
         if not isinstance(shell, PointShell):
             shell = self._tool_of(shell)
-        with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
-            return feeler.collides(poses, progress=progress)
+        with self.batch_tool(
+            shell, where=where, exclude=exclude, law=PLANE, device=device
+        ) as batch_tool:
+            return batch_tool.collides(poses, progress=progress)
 
     def clearance(
         self,
@@ -255,17 +265,21 @@ class Queries:
         if not isinstance(shell, PointShell):
             shell = self._tool_of(shell)
         if exact:
+            from hapticdb.batches.batch_tool import reach_of  # noqa: PLC0415 - likewise
             from hapticdb.batches.exact import exact_clearance  # noqa: PLC0415 - loads kernels
-            from hapticdb.batches.feeler import reach_of  # noqa: PLC0415 - likewise
 
             if device != "cpu":
                 raise UsageError(f"device {device!r}: exact distances are computed on processors")
             limit = np.inf if reach is None else reach_of(reach, 1.0)
             with self._store.snapshot():
-                felt = Filter(where, exclude).felt(self._store.objects(), self._store.url)
-                return exact_clearance(self._store, felt, shell, as_poses(poses), limit, progress)
-        with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
-            return feeler.clearance(poses, reach, progress=progress)
+                selection = Filter(where, exclude).select(self._store.objects(), self._store.url)
+                return exact_clearance(
+                    self._store, selection, shell, as_poses(poses), limit, progress
+                )
+        with self.batch_tool(
+            shell, where=where, exclude=exclude, law=PLANE, device=device
+        ) as batch_tool:
+            return batch_tool.clearance(poses, reach, progress=progress)
 
     def distance(self, a: int | str, b: int | str) -> "Distance":
         """Least distance of the surfaces of two objects, with the nearest places.
@@ -279,7 +293,7 @@ class Queries:
             ones, others = (find_objects(self._store, [word]) for word in (a, b))
             return least_distance(self._store, ones, others)
 
-    def feeler(
+    def batch_tool(
         self,
         shell: PointShell,
         *,
@@ -289,7 +303,7 @@ class Queries:
         budget_bytes: int | None = None,
         jobs: int | None = None,
         device: "BatchDevice" = "cpu",
-    ) -> "Feeler":
+    ) -> "BatchTool":
         """Make a tool with cells resident in memory from one batch of poses to the next.
 
         shell, where, exclude, law : as for `touch`; the law is chosen for the present objects
@@ -301,8 +315,8 @@ class Queries:
         which has no cells, for a budget too small or above this machine's memory, or for objects
         without the law's input.
         """
-        from hapticdb.batches.feeler import Feeler  # noqa: PLC0415 - loads numba
+        from hapticdb.batches.batch_tool import BatchTool  # noqa: PLC0415 - loads numba
 
-        felt = self._filters.of(where, exclude)
+        selection = self._filters.of(where, exclude)
         chosen = self._query.law_now(as_law(law))
-        return Feeler(self._query, shell, felt, chosen, budget_bytes, jobs, device)
+        return BatchTool(self._query, shell, selection, chosen, budget_bytes, jobs, device)

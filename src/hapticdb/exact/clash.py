@@ -1,9 +1,9 @@
 """What a pair of surfaces is: apart, touching, overlapping, one inside the other, or not known.
 
-A distance above zero is proved by `kernels.triangles.nearest`. Surfaces that meet only touch if a
-motion frees them that moves no place by more than the contact tolerance (`exact.separation`). How
-deep others overlap is bounded from below by the penetration depth of one in the closed bodies of
-the other, and from above by the least motion that frees them.
+A distance above zero is proved by `kernels.triangles.surface_distance`. Surfaces that meet only
+touch if a motion frees them that moves no place by more than the contact tolerance
+(`exact.separation`). How deep others overlap is bounded from below by the penetration depth of one
+in the closed bodies of the other, and from above by the least motion that frees them.
 """
 
 from typing import NamedTuple
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.exact.separation import Separation
-from hapticdb.exact.shapes import Shapes
-from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.exact.shape_cache import Shapes
+from hapticdb.kernels.triangles.surface_distance import Nearest, nearest
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.store.base import Object
 from hapticdb.verdicts import Kind
@@ -24,7 +24,7 @@ TINY = 1e-9
 """Metres: surfaces that are farther apart do not meet."""
 
 
-class Judged(NamedTuple):
+class PairResult(NamedTuple):
     """What a pair is; places in the frame of the first surface.
 
     at_least, at_most : metres, of the gap, or of the depth where they overlap: 0 and infinite where
@@ -46,38 +46,40 @@ class PlacedPair(NamedTuple):
     pose: Floats
 
 
-def judge_placed(shapes: Shapes, pair: PlacedPair, within: float, contact: float) -> Judged | None:
+def measure_placed(
+    shapes: Shapes, pair: PlacedPair, within: float, contact: float
+) -> PairResult | None:
     """Judge a pair of objects; None if one was written meanwhile."""
     a, b = shapes.shape(pair.one), shapes.shape(pair.other)
-    return None if a is None or b is None else judge(a, b, pair.pose, within, contact)
+    return None if a is None or b is None else classify_pair(a, b, pair.pose, within, contact)
 
 
-def judge(
+def classify_pair(
     a: CollisionShape, b: CollisionShape, pose: Floats, within: float, contact: float
-) -> Judged:
+) -> PairResult:
     """Judge two surfaces, the second one at a rigid pose (4, 4) in the frame of the first."""
     error = a.chord + b.chord
     near = _nearest(a, b, pose, within + error)
     if a.is_cloud or b.is_cloud:
-        return _told(Kind.NOT_KNOWN if near.pairs[0, 0] >= 0 else Kind.FAR, near)
+        return _result(Kind.NOT_KNOWN if near.pairs[0, 0] >= 0 else Kind.FAR, near)
     gap, separation = float(near.at_least[0]), Separation(a, b)
     if gap > 0.0:
         if separation.is_nested(pose):
             near = near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose)
-            return _told(Kind.INSIDE if gap > error or not error else Kind.NOT_KNOWN, near, error)
+            return _result(Kind.INSIDE if gap > error or not error else Kind.NOT_KNOWN, near, error)
         if near.pairs[0, 0] < 0:
-            return _told(Kind.FAR, near, error)
+            return _result(Kind.FAR, near, error)
         if gap - error > contact:
-            return _told(Kind.APART, near, error)
+            return _result(Kind.APART, near, error)
         if gap + error <= contact or not error:
-            return _told(Kind.TOUCHING, near, error)
-        return _told(Kind.NOT_KNOWN, near, error)
+            return _result(Kind.TOUCHING, near, error)
+        return _result(Kind.NOT_KNOWN, near, error)
     separation.note_nearest(pose, near.pairs)
     freed = _freed(separation, pose, contact - error)
     if freed == Kind.TOUCHING or (freed == Kind.INSIDE and not error):
-        return _told(freed, near, error)
+        return _result(freed, near, error)
     if error and _freed(separation, pose, contact + error) == Kind.TOUCHING:
-        return _told(Kind.NOT_KNOWN, near, error)
+        return _result(Kind.NOT_KNOWN, near, error)
     return _overlap(separation, pose, contact, near, error)
 
 
@@ -96,10 +98,10 @@ def _freed(separation: Separation, pose: Floats, reach: float) -> Kind | None:
     return found
 
 
-def _told(kind: Kind, near: Nearest, error: float = 0.0) -> Judged:
+def _result(kind: Kind, near: Nearest, error: float = 0.0) -> PairResult:
     at_least = max(float(near.at_least[0]) - error, 0.0)
     at_most = float(near.at_most[0]) + error
-    return Judged(kind, at_least, at_most, near.on_a[0], near.on_b[0])
+    return PairResult(kind, at_least, at_most, near.on_a[0], near.on_b[0])
 
 
 def _nearest(
@@ -110,11 +112,11 @@ def _nearest(
 
 def _overlap(
     separation: Separation, pose: Floats, contact: float, near: Nearest, error: float
-) -> Judged:
+) -> PairResult:
     """Bounds of how deep surfaces overlap that no motion of the tolerance frees."""
     depth, place = separation.depth(pose, contact)
     least = max(contact + error, depth)
     at_most = separation.least(pose, least, separation.most_reach, TINY, gap=0.0)
     place = place if depth else near.on_a[0]
     at_most = np.inf if at_most is None else at_most + error
-    return Judged(Kind.OVERLAPPING, max(depth - error, 0.0), at_most, place, place)
+    return PairResult(Kind.OVERLAPPING, max(depth - error, 0.0), at_most, place, place)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hapticdb.exact.distance import Pair
 from hapticdb.exact.separation import GROWTH, NOTHING, SAME, MovedPair, Separation
-from hapticdb.kernels.triangles.sweeping import MEETING
+from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.pointshell.shape import CollisionShape
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ MOST_CHANGES = 30
 """Changes of motions along the path."""
 ON, FINE_HIT = 2.0, 0.1
 """Reaches beyond a hit for the pose of its depth, and the depth's relative tolerance."""
-LOOKS = 1500
+MOST_QUERIES = 1500
 """Distance queries for a depth: some hundredths of a second. Any number gives a lower bound."""
 
 
@@ -48,7 +48,7 @@ class Contact:
 
     start : upper bound of the overlap at the start, metres, infinite without a separating motion;
     start_at_least : proved penetration depth there; reach : of the motions; by : kind of the last
-    one, empty without any; error : as given; way : path parameter followed so far, metres;
+    one, empty without any; error : as given; parameter : path parameter followed so far, metres;
     is_over, is_apart, is_hit : whether it has ended, by separation or by a collision.
     """
 
@@ -66,7 +66,7 @@ class Contact:
         self._still = self._separation.moved(NOTHING)
         self.start, self.start_at_least, self.by = contact, 0.0, ""
         self.reach = contact - error + CLEARANCE
-        self.way, self.is_over, self.is_apart, self.is_hit = 0.0, False, False, False
+        self.parameter, self.is_over, self.is_apart, self.is_hit = 0.0, False, False, False
         self._since, self._block, self._changes = 0.0, BLOCK, 0
         self._moved = self._begun(gap, seated=seated)
         if self._moved is None:
@@ -76,7 +76,7 @@ class Contact:
 
     def _begun(self, gap: float, *, seated: bool) -> MovedPair | None:
         """The first motion that frees the surfaces at the start; None if there is none."""
-        pose, found = self._pair.way.at([0.0])[0], self._separation
+        pose, found = self._pair.path.at([0.0])[0], self._separation
         self._motions: Iterator[MovedPair] = iter(())
         self._motions = found.separating(pose, self.reach, CLEARANCE, gap=gap)
         first = next(self._motions, None)
@@ -88,7 +88,7 @@ class Contact:
         if seated:  # mostly that frees: the depth of what is sunk so little takes long to prove
             reach = found.least(pose, self.reach, nearly, CLEARANCE, gap=gap)
         if reach is None:
-            depth = found.depth(pose, self._contact, most=LOOKS)[0]
+            depth = found.depth(pose, self._contact, most=MOST_QUERIES)[0]
             self.start_at_least = max(depth - abs(self.error), 0.0)
         if reach is None and seated:
             least = max(nearly, depth + CLEARANCE)
@@ -104,7 +104,7 @@ class Contact:
 
         So a foil on an open sheet is on the side of its touching face.
         """
-        pose, found = self._pair.way.at([0.0])[0], self._separation
+        pose, found = self._pair.path.at([0.0])[0], self._separation
         for share in SHARES:
             reach = CLEARANCE + share * (self.reach - CLEARANCE)
             motions = found.separating(pose, reach, CLEARANCE, gap=0.0, thorough=False)
@@ -117,13 +117,13 @@ class Contact:
     @property
     def is_sliding(self) -> bool:
         """Whether the tool moves on while it touches."""
-        return self.way > SLIDE * self._contact
+        return self.parameter > SLIDE * self._contact
 
     def advance(self, end: float) -> None:
         """Follow the contact to a path parameter, or to its end."""
-        while self.way < end and not self.is_over:
+        while self.parameter < end and not self.is_over:
             stop, is_apart = self._next_apart(end)
-            while self.way < stop and not self.is_over:
+            while self.parameter < stop and not self.is_over:
                 self._pair.check_time()
                 self._go_on(stop)
             if is_apart and not self.is_over and self._is_left(stop):
@@ -131,65 +131,67 @@ class Contact:
 
     def depth(self) -> tuple[float, Floats]:
         """Penetration depth beyond the hit, proved from below, and its place (3,), world frame."""
-        way = min(self.way + ON * self.reach, self._pair.way.length)
-        pose = self._pair.way.at([way])[0]
-        depth, place = self._separation.depth(pose, self._contact, FINE_HIT, LOOKS)
+        parameter = min(self.parameter + ON * self.reach, self._pair.path.length)
+        pose = self._pair.path.at([parameter])[0]
+        depth, place = self._separation.depth(pose, self._contact, FINE_HIT, MOST_QUERIES)
         return max(depth - abs(self.error), 0.0), place
 
     def _next_apart(self, end: float) -> tuple[float, bool]:
         """The next sample with separate surfaces, or the last one of a block."""
         stride = STRIDE * self._contact
-        ways = np.minimum(self.way + stride * np.arange(1, self._block + 1), end)
-        ways = ways[: int(np.searchsorted(ways, end)) + 1]
+        parameters = np.minimum(self.parameter + stride * np.arange(1, self._block + 1), end)
+        parameters = parameters[: int(np.searchsorted(parameters, end)) + 1]
         self._block = min(2 * self._block, MOST_BLOCK)
         enough = self._contact + abs(self.error)
-        gaps = self._pair.measure(ways, np.full(len(ways), 2.0 * enough), enough).at_least
+        gaps = self._pair.measure(
+            parameters, np.full(len(parameters), 2.0 * enough), enough
+        ).at_least
         apart = np.flatnonzero(gaps > enough)
-        return (float(ways[apart[0]]), True) if len(apart) else (float(ways[-1]), False)
+        return (float(parameters[apart[0]]), True) if len(apart) else (float(parameters[-1]), False)
 
-    def _is_left(self, way: float) -> bool:
+    def _is_left(self, parameter: float) -> bool:
         """Whether the tool itself gets from its moved place back to its own."""
         assert self._moved is not None  # noqa: S101 - it is followed
-        return self._separation.joins(self._moved, self._still, self._pair.way.at([way])[0])
+        return self._separation.joins(self._moved, self._still, self._pair.path.at([parameter])[0])
 
     def _go_on(self, stop: float) -> None:
         """Follow the motion to a path parameter, change it at a collision, or note a hit."""
         assert self._moved is not None  # noqa: S101 - as above
-        met = self._pair.first_met(self._moved, self.way, stop)
-        self.way = max(self.way, met)
-        if met >= stop:
+        collision = self._pair.first_collision(self._moved, self.parameter, stop)
+        self.parameter = max(self.parameter, collision)
+        if collision >= stop:
             return
-        pose = self._pair.way.at([self.way])[0]
+        pose = self._pair.path.at([self.parameter])[0]
         for moved in islice(self._motions, MOST_TRIED):
             if not self._separation.is_free(moved, pose, MEETING):
                 continue
-            reached = self._pair.first_met(moved, 0.0, stop)
-            if reached > self.way:
+            reached = self._pair.first_collision(moved, 0.0, stop)
+            if reached > self.parameter:
                 self._change(moved, 0.0, reached)
                 return
         self._motions = iter(())
-        if self._changes == MOST_CHANGES or not self._hand_over(met):
+        if self._changes == MOST_CHANGES or not self._hand_over(collision):
             self.is_over = self.is_hit = True
 
-    def _hand_over(self, met: float) -> bool:
+    def _hand_over(self, collision: float) -> bool:
         """Change to a shift beyond a collision, a little before it."""
         assert self._moved is not None  # noqa: S101 - as above
-        beyond = min(met + BEYOND * self.reach, self._pair.way.length)
-        there = self._pair.way.at([beyond])[0]
+        beyond = min(collision + BEYOND * self.reach, self._pair.path.length)
+        there = self._pair.path.at([beyond])[0]
         for back in BACKS:
-            way = max(met - back * self.reach, self._since)
-            pose = self._pair.way.at([way])[0]
+            parameter = max(collision - back * self.reach, self._since)
+            pose = self._pair.path.at([parameter])[0]
             shifts = self.reach * self._separation.shifts(pose)
             for moved in self._separation.shifted(pose, shifts, CLEARANCE, self._still):
                 if (
                     self._separation.is_free(moved, there, MEETING)
                     and self._separation.joins(self._moved, moved, pose)
-                    and self._pair.first_met(moved, way, beyond) >= beyond
+                    and self._pair.first_collision(moved, parameter, beyond) >= beyond
                 ):
-                    self._change(moved, way, beyond)
+                    self._change(moved, parameter, beyond)
                     self._changes += 1
                     return True
         return False
 
-    def _change(self, moved: MovedPair, since: float, way: float) -> None:
-        self._moved, self._since, self.way, self.by = moved, since, way, moved.motion.by
+    def _change(self, moved: MovedPair, since: float, parameter: float) -> None:
+        self._moved, self._since, self.parameter, self.by = moved, since, parameter, moved.motion.by

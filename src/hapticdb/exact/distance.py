@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import MovedPair
-from hapticdb.kernels.surfaces.sides import TriangleTree
-from hapticdb.kernels.triangles.motion import PathMotion
-from hapticdb.kernels.triangles.nearest import Nearest
-from hapticdb.kernels.triangles.sweeping import MEETING, Search
-from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH
+from hapticdb.kernels.triangles.path_distance import MEETING, Search
+from hapticdb.kernels.triangles.path_motion import PathMotion
+from hapticdb.kernels.triangles.surface_distance import Nearest
+from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.store.base import Object
 
 Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ class Least(NamedTuple):
     """A distance, metres, its path parameter, and the nearest places (3,) there."""
 
     at_most: float
-    way: float
+    parameter: float
     on_object: Floats
     on_tool: Floats
 
@@ -55,33 +55,33 @@ class Pair:
     """
 
     def __init__(
-        self, tree: TriangleTree, tool: MovingSurface, way: ToolPath, until: float = np.inf,
+        self, tree: TriangleBVH, tool: ToolSurface, path: ToolPath, until: float = np.inf,
         end: float | None = None, error: float = 0.0, bounds: Floats | None = None,
     ) -> None:  # fmt: skip
         self.error, self._bounds = error, bounds
-        self.tree, self.tool, self.way, self.until = tree, tool, way, until
-        self.length = way.length if end is None else end
-        self.looks = 0
+        self.tree, self.tool, self.path, self.until = tree, tool, path, until
+        self.length = path.length if end is None else end
+        self.queries = 0
 
-    def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
-        """Measure at path parameters (n,), as `kernels.triangles.nearest`."""
+    def measure(self, parameters: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
+        """Measure at path parameters (n,), as `kernels.triangles.surface_distance`."""
         self.check_time()
-        self.looks += len(ways)
-        return self.tool.nearest(self.tree, self.way.at(ways), farthest, enough)
+        self.queries += len(parameters)
+        return self.tool.nearest(self.tree, self.path.at(parameters), farthest, enough)
 
     def nearest_at(self, pose: Floats) -> Nearest:
         """Measure at one pose (4, 4) of the tool, however far."""
         return self.tool.nearest(self.tree, pose[None], np.array([np.inf]))
 
-    def first_met(self, moved: MovedPair, begin: float, end: float) -> float:
+    def first_collision(self, moved: MovedPair, begin: float, end: float) -> float:
         """Path parameter of the first collision after a small motion, or the end."""
-        motion = self.way.motion
+        motion = self.path.motion
         search = Search(
             moved.object, moved.tool, motion._replace(centers=motion.centers + moved.motion.shift),
             radius=moved.radius, begin=begin, best=2.0 * MEETING, fine=COARSE,
         )  # fmt: skip
         self._finish(search, end)
-        return float(search.found.way[0]) if search.found.way[0] >= 0.0 else end
+        return float(search.found.parameter[0]) if search.found.parameter[0] >= 0.0 else end
 
     def least(self, begin: float, best: float) -> tuple[Least | None, float]:
         """Least distance from a path parameter on, if it is less than `best`; else None.
@@ -89,9 +89,9 @@ class Pair:
         Returns the proved bound, too. In a collision it is the first one. After few proximity
         queries, the tolerance is nine times finer.
         """
-        found, closed, looks = self._search(begin, best, COARSE)
+        found, closed, queries = self._search(begin, best, COARSE)
         known = best if found is None else found.at_most
-        if MEETING < known < np.inf and looks <= EASY:
+        if MEETING < known < np.inf and queries <= EASY:
             nearer, closed, _ = self._search(begin, known, FINE)
             found = nearer or found
         if found is None:
@@ -100,66 +100,68 @@ class Pair:
 
     def _search(self, begin: float, best: float, fine: float) -> tuple[Least | None, float, int]:
         """The same to `fine` metres, and the number of proximity queries."""
-        least, closed, looks = self._sampled(begin, best), best, 0
+        least, closed, queries = self._sampled(begin, best), best, 0
         for motion in self._motions(best if least is None else least.at_most):
             known, end = best if least is None else least.at_most, self.length
             if least is not None and known <= MEETING:
-                end = min(end, least.way)
-                if motion.ways[0] >= end:
+                end = min(end, least.parameter)
+                if motion.parameters[0] >= end:
                     break
             search = self.tool.search(self.tree, motion, begin=begin, best=known, fine=fine)
             self._finish(search, end)
-            looks += search.looks
-            (at_most, bound), (way,), (on_object, on_tool) = search.found
+            queries += search.queries
+            (at_most, bound), (parameter,), (on_object, on_tool) = search.found
             closed = min(closed, float(bound))
-            if way < 0.0:
+            if parameter < 0.0:
                 continue
-            near = self.measure(np.array([way]), np.array([at_most]))  # all of both surfaces there
+            near = self.measure(
+                np.array([parameter]), np.array([at_most])
+            )  # all of both surfaces there
             if near.pairs[0, 0] >= 0:
                 at_most, on_object, on_tool = near.at_most[0], near.on_a[0], near.on_b[0]
-            least = Least(float(at_most), float(way), on_object, on_tool)
-        return least, closed, looks
+            least = Least(float(at_most), float(parameter), on_object, on_tool)
+        return least, closed, queries
 
     def _sampled(self, begin: float, best: float) -> Least | None:
         """The nearest of some samples, if nearer than `best`: a long search begins with it."""
-        if self._bounds is None or len(self.way.ways) <= FEW:
+        if self._bounds is None or len(self.path.parameters) <= FEW:
             return None
-        ways = np.linspace(begin, self.length, SAMPLES)
-        near = self.measure(ways, np.full(len(ways), best))
+        parameters = np.linspace(begin, self.length, SAMPLES)
+        near = self.measure(parameters, np.full(len(parameters), best))
         n = int(np.argmin(near.at_most))
         if near.pairs[n, 0] < 0:
             return None
-        return Least(float(near.at_most[n]), float(ways[n]), near.on_a[n], near.on_b[n])
+        return Least(float(near.at_most[n]), float(parameters[n]), near.on_a[n], near.on_b[n])
 
     def _motions(self, best: float) -> Iterator[PathMotion]:
         """Parts of the path on which the boxes are nearer than `best`; all of it without boxes."""
-        ways, motion = self.way.ways, self.way.motion
-        if self._bounds is None or len(ways) <= FEW:
+        parameters, motion = self.path.parameters, self.path.motion
+        if self._bounds is None or len(parameters) <= FEW:
             yield motion
             return
-        edges = np.linspace(0.0, self.way.length, PARTS + 1)
-        middles = self.way.at(0.5 * (edges[:-1] + edges[1:]))
+        edges = np.linspace(0.0, self.path.length, PARTS + 1)
+        middles = self.path.at(0.5 * (edges[:-1] + edges[1:]))
         gaps = self.tool.box_gaps(self._bounds[None], middles, 0.5 * np.diff(edges))[0]
         ends = np.flatnonzero(np.diff(np.concatenate([[False], gaps < best, [False]])))
         for first, last in ends.reshape(-1, 2).tolist():
-            low = int(self.way.segments(edges[first : first + 1])[0])
-            high = int(np.searchsorted(ways, edges[last])) + 1
+            low = int(self.path.segments(edges[first : first + 1])[0])
+            high = int(np.searchsorted(parameters, edges[last])) + 1
             yield motion._replace(
-                ways=ways[low:high], centers=motion.centers[low:high],
+                parameters=parameters[low:high], centers=motion.centers[low:high],
                 rotations=motion.rotations[low:high], turns=motion.turns[low : high - 1],
             )  # fmt: skip
 
     def _finish(self, search: Search, end: float) -> None:
         """Search to an end; on a part of the path, as if they collided there."""
-        if end < self.way.length:
-            search.found.distance[0], search.found.way[0] = MEETING, end
+        if end < self.path.length:
+            search.found.distance[0], search.found.parameter[0] = MEETING, end
         is_over = False
         while not is_over:
             self.check_time()
             is_over = search.go_on(STEPS)
-        self.looks += search.looks
-        if end < self.way.length and search.found.way[0] >= end:
-            search.found.way[0] = -1.0
+        self.queries += search.queries
+        if end < self.path.length and search.found.parameter[0] >= end:
+            search.found.parameter[0] = -1.0
 
     def check_time(self) -> None:
         """End the sweep by OverTimeError if its time is over."""
@@ -167,13 +169,11 @@ class Pair:
             raise OverTimeError
 
 
-def box_gaps(
-    tool: MovingSurface, way: ToolPath, objects: Sequence[Object]
-) -> tuple[Floats, Floats]:
+def box_gaps(tool: ToolSurface, path: ToolPath, objects: Sequence[Object]) -> tuple[Floats, Floats]:
     """Ends (N + 1,) of stretches of a path; distances (O, N) of boxes, never too large."""
-    edges = np.linspace(0.0, way.length, (STRETCHES if way.length else 1) + 1)
+    edges = np.linspace(0.0, path.length, (STRETCHES if path.length else 1) + 1)
     bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
-    middles = way.at(0.5 * (edges[:-1] + edges[1:]))
+    middles = path.at(0.5 * (edges[:-1] + edges[1:]))
     return edges, tool.box_gaps(bounds, middles, 0.5 * np.diff(edges))
 
 

@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
-from hapticdb.exact.clash import judge
+from hapticdb.exact.clash import classify_pair
 from hapticdb.exact.distance import Pair, box_gaps
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import CONTACT
 from hapticdb.exact.sweep import center_of
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.kernels.triangles.sweeping import MEETING
-from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.pointshell.shape import CollisionShape
+from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.poses import rotation_of
 from hapticdb.store.base import Progress
 from hapticdb.store.finding import Words
@@ -87,21 +87,23 @@ def find_meetings(
     if not 0.0 < contact < np.inf:
         raise UsageError(f"contact {contact} m: give a length above 0")
     with env.store.snapshot():
-        tool = MovingSurface(env.shell(*of, points=1, inset=0.0))
-        way = ToolPath.of(poses, tool.corners, center_of(tool, about))
-        objects = env.felt(against, of)
-        gaps = box_gaps(tool, way, objects)[1].min(axis=1, initial=np.inf)
+        tool = ToolSurface(env.shell(*of, points=1, inset=0.0))
+        path = ToolPath.of(poses, tool.corners, center_of(tool, about))
+        objects = env.select(against, of)
+        gaps = box_gaps(tool, path, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
         found: list[Meeting] = []
         for n, (obj, part) in enumerate(parts_of(env.store, near)):
             still = CollisionShape(
                 part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord, index=part.faces
             )
-            for ways in _intervals(Pair(still.tree, tool, way), contact):
+            for parameters in _intervals(Pair(still.tree, tool, path), contact):
                 kind, depth, place = _gravest(
-                    still, tool, way.at(np.linspace(*ways, POSES)), contact
+                    still, tool, path.at(np.linspace(*parameters, POSES)), contact
                 )
-                found.append(Meeting(obj.id, obj.name, *_numbers(way, ways), kind, depth, place))
+                found.append(
+                    Meeting(obj.id, obj.name, *_numbers(path, parameters), kind, depth, place)
+                )
             if progress is not None:
                 progress(n + 1, len(near))
     return sorted(found, key=lambda one: (one.begin, one.end, one.id))
@@ -133,22 +135,22 @@ def _intervals(pair: Pair, contact: float) -> Iterator[tuple[float, float]]:
         first = pair.least(end, 2.0 * MEETING)[0]
         if first is None or first.at_most > MEETING:
             return
-        end = _parted(pair, first.way, contact)
-        yield first.way if first.way > MEETING else 0.0, end
-        if end >= pair.way.length:
+        end = _parted(pair, first.parameter, contact)
+        yield first.parameter if first.parameter > MEETING else 0.0, end
+        if end >= pair.path.length:
             return
 
 
-def _parted(pair: Pair, way: float, contact: float) -> float:
+def _parted(pair: Pair, parameter: float, contact: float) -> float:
     """Path parameter of the parting by more than `contact` after a meeting, or the last one."""
-    length = pair.way.length
+    length = pair.path.length
     step = max(STEP * contact, length / MOST_STEPS)
-    for start in np.arange(way, length, 64 * step):
-        ways = np.minimum(start + step * np.arange(1, 65), length)
-        is_free = _gaps(pair, ways, contact) > contact
+    for start in np.arange(parameter, length, 64 * step):
+        parameters = np.minimum(start + step * np.arange(1, 65), length)
+        is_free = _gaps(pair, parameters, contact) > contact
         if is_free.any():
-            high = float(ways[int(np.argmax(is_free))])
-            low = max(high - step, way)
+            high = float(parameters[int(np.argmax(is_free))])
+            low = max(high - step, parameter)
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + high)
                 is_apart = _gaps(pair, np.array([middle]), contact)[0] > contact
@@ -157,23 +159,23 @@ def _parted(pair: Pair, way: float, contact: float) -> float:
     return length
 
 
-def _gaps(pair: Pair, ways: Floats, contact: float) -> Floats:
-    return pair.measure(ways, np.full(len(ways), 2.0 * contact)).at_least
+def _gaps(pair: Pair, parameters: Floats, contact: float) -> Floats:
+    return pair.measure(parameters, np.full(len(parameters), 2.0 * contact)).at_least
 
 
 def _gravest(
     still: CollisionShape, moved: CollisionShape, poses: Floats, contact: float
 ) -> tuple[Kind, float, tuple[float, ...]]:
     """The gravest kind of a pair at poses, its depth, and its place."""
-    judged = [judge(still, moved, pose, 2.0 * contact, contact) for pose in poses]
-    told = [one for one in judged if one.kind.gravity <= Kind.TOUCHING.gravity] or judged
-    worst = min(told, key=lambda one: (one.kind.gravity, -one.at_least))
+    classified = [classify_pair(still, moved, pose, 2.0 * contact, contact) for pose in poses]
+    grave = [one for one in classified if one.kind.gravity <= Kind.TOUCHING.gravity] or classified
+    worst = min(grave, key=lambda one: (one.kind.gravity, -one.at_least))
     kind = Kind.TOUCHING if worst.kind.is_free else worst.kind
     depth = worst.at_least if kind == Kind.OVERLAPPING else 0.0
     return kind, depth, tuple(worst.on_a.tolist())
 
 
-def _numbers(way: ToolPath, ways: tuple[float, float]) -> tuple[float, float]:
+def _numbers(path: ToolPath, parameters: tuple[float, float]) -> tuple[float, float]:
     """Numbers of poses at path parameters, with the share of the path to the next one."""
-    begin, end = np.interp(ways, way.ways, np.arange(len(way.ways))).tolist()
+    begin, end = np.interp(parameters, path.parameters, np.arange(len(path.parameters))).tolist()
     return begin, end

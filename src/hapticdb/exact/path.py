@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.triangles.motion import PathMotion, poses_kernel
+from hapticdb.kernels.triangles.path_motion import PathMotion, poses_kernel
 from hapticdb.poses import as_floats, quaternion_of, rotation_of
 
 Floats = NDArray[np.float64]
@@ -22,30 +22,30 @@ AT_ONCE = 64
 class SampledPath:
     """M given samples of a motion, linear in between.
 
-    ways (M,) : path parameter at each, metres, ascending; poses (M, J) : joint values.
+    parameters (M,) : path parameter at each, metres, ascending; poses (M, J) : joint values.
     """
 
-    ways: Floats
+    parameters: Floats
     poses: Floats
 
     @property
     def length(self) -> float:
         """Metres at the last sample."""
-        return float(self.ways[-1])
+        return float(self.parameters[-1])
 
-    def segments(self, ways: Floats) -> Ints:
+    def segments(self, parameters: Floats) -> Ints:
         """Segments (n,) of path parameters (n,), 0 .. M - 2: the last sample before each."""
-        found = np.searchsorted(self.ways, ways, side="right") - 1
-        return np.asarray(np.clip(found, 0, max(len(self.ways) - 2, 0)))
+        found = np.searchsorted(self.parameters, parameters, side="right") - 1
+        return np.asarray(np.clip(found, 0, max(len(self.parameters) - 2, 0)))
 
-    def fraction(self, way: float) -> float:
+    def fraction(self, parameter: float) -> float:
         """Share of the path's motion before a path parameter, 0 .. 1."""
-        return min(way / self.length, 1.0) if self.length > 0.0 else 0.0
+        return min(parameter / self.length, 1.0) if self.length > 0.0 else 0.0
 
-    def at(self, ways: ArrayLike) -> Floats:
+    def at(self, parameters: ArrayLike) -> Floats:
         """Samples (n, J) at path parameters (n,), clamped to the ends of the path."""
-        given = np.asarray(ways, dtype=np.float64)
-        return np.stack([np.interp(given, self.ways, one) for one in self.poses.T], axis=-1)
+        given = np.asarray(parameters, dtype=np.float64)
+        return np.stack([np.interp(given, self.parameters, one) for one in self.poses.T], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class ToolPath(SampledPath):
 
     Attributes
     ----------
-    ways : (M,)
+    parameters : (M,)
         Path parameter at each given pose, metres: no place of the tool moves more than the
         difference from one to the next.
     poses : (M, 4, 4)
@@ -83,23 +83,25 @@ class ToolPath(SampledPath):
             motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
         rotations = rotation_of(quaternions)
         motion += _turned(corners - center, turns, rotations[:-1])
-        ways = np.concatenate([[0.0], np.cumsum(motion)])
-        if not np.isfinite(ways[-1]):
+        parameters = np.concatenate([[0.0], np.cumsum(motion)])
+        if not np.isfinite(parameters[-1]):
             raise UsageError("the path is longer than numbers go: check its unit")
-        again = list(range(len(ways))) if len(ways) > 1 else [0, 0]  # two poses at least
+        again = (
+            list(range(len(parameters))) if len(parameters) > 1 else [0, 0]
+        )  # two poses at least
         moved = (
-            ways[again],
+            parameters[again],
             centers[again],
             rotations[again],
             turns if len(turns) else np.zeros((1, 3)),
         )
-        return cls(ways, given, PathMotion(*map(np.ascontiguousarray, (*moved, center))))
+        return cls(parameters, given, PathMotion(*map(np.ascontiguousarray, (*moved, center))))
 
-    def at(self, ways: ArrayLike) -> Floats:
+    def at(self, parameters: ArrayLike) -> Floats:
         """Poses (n, 4, 4) at path parameters (n,), clamped to the ends of the path."""
-        ways = np.array(ways, dtype=np.float64)
-        out = np.tile(np.eye(4), (len(ways), 1, 1))
-        poses_kernel(self.motion, self.segments(ways), ways, out)
+        parameters = np.array(parameters, dtype=np.float64)
+        out = np.tile(np.eye(4), (len(parameters), 1, 1))
+        poses_kernel(self.motion, self.segments(parameters), parameters, out)
         return out
 
 

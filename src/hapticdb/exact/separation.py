@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.surfaces.sides import TriangleTree, refitted
+from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH, refitted
 from hapticdb.kernels.triangles.depth import depth_in, pieces_kernel
-from hapticdb.kernels.triangles.nearest import free_shift_kernel, nearest
 from hapticdb.kernels.triangles.offsets import (
     ACROSS,
     ALONG,
@@ -24,6 +23,7 @@ from hapticdb.kernels.triangles.offsets import (
     any_near_kernel,
     offset_kernel,
 )
+from hapticdb.kernels.triangles.surface_distance import free_shift_kernel, nearest
 from hapticdb.pointshell.shape import CollisionShape
 
 Floats = NDArray[np.float64]
@@ -45,7 +45,7 @@ GROWTH, FINE = 1.4, 0.05
 """Factor between successive reaches of the search, and relative tolerance of the least one."""
 FINE_DEPTH, TOLERANCE = 0.02, 0.2
 """Tolerances of a penetration depth: relative, and as a share of the contact tolerance."""
-QUICK, MOST_LOOKS = 256, 1_000_000
+QUICK, MOST_QUERIES = 256, 1_000_000
 """Limits of distance queries for a depth: some milliseconds, and some seconds."""
 MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
@@ -74,8 +74,8 @@ class MovedPair(NamedTuple):
     """Both surfaces after a motion: trees, own frames, the tool's shift, and a ball's radius."""
 
     motion: Motion
-    object: TriangleTree
-    tool: TriangleTree
+    object: TriangleBVH
+    tool: TriangleBVH
     radius: float
 
 
@@ -139,7 +139,7 @@ class Separation:
         return min(MOST_REACH, MOST_SHARE * min(edges))
 
     def depth(
-        self, pose: Floats, contact: float, fine: float = FINE_DEPTH, most: int = MOST_LOOKS
+        self, pose: Floats, contact: float, fine: float = FINE_DEPTH, most: int = MOST_QUERIES
     ) -> tuple[float, Floats]:
         """Proved penetration depth, metres, and its place (3,), the object's frame.
 
@@ -168,9 +168,9 @@ class Separation:
         moved = moved or self.moved(NOTHING)
         motion, own, theirs = moved.motion, moved.tool.corners, moved.object.corners
         placed = _shifted(pose, motion)
-        return _holds_piece(
+        return _contains_piece(
             self._object, motion.object, self._tool, own, placed, is_back=False
-        ) or _holds_piece(
+        ) or _contains_piece(
             self._tool, motion.tool, self._object, theirs, placed, motion.growth, is_back=True
         )
 
@@ -309,7 +309,7 @@ def _shifted(pose: Floats, motion: Motion) -> Floats:
     return placed
 
 
-def _moved_tree(shape: CollisionShape, by: Floats | None) -> TriangleTree:
+def _moved_tree(shape: CollisionShape, by: Floats | None) -> TriangleBVH:
     return shape.tree if by is None else refitted(shape.tree, shape.tree.corners + by)
 
 
@@ -344,7 +344,7 @@ def _travel(first: Motion, second: Motion) -> float:
     return found
 
 
-def _holds_piece(
+def _contains_piece(
     outer: CollisionShape, outer_by: Floats | None, inner: CollisionShape, corners: Floats,
     pose: Floats, growth: float = 0.0, *, is_back: bool,
 ) -> bool:  # fmt: skip

@@ -19,11 +19,11 @@ from hapticdb.exact.path import SampledPath, ToolPath
 from hapticdb.exact.separation import CONTACT, SAME, Separation
 from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.kernels.triangles.sweeping import MEETING
+from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.mesh import Part
-from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 
@@ -85,20 +85,20 @@ def sweep(
     ObjectNotFoundError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    asked = SweepRequest(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
-    tool = MovingSurface(shell)
-    way = ToolPath.of(poses, tool.corners, center_of(tool, about))
-    return swept_along(env, way, [Mover(tool, way)], asked, where, exclude)
+    request = SweepRequest(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
+    tool = ToolSurface(shell)
+    path = ToolPath.of(poses, tool.corners, center_of(tool, about))
+    return swept_along(env, path, [Mover(tool, path)], request, where, exclude)
 
 
 def swept_along(
-    env: Environment, way: SampledPath, movers: Sequence["Mover"], asked: "SweepRequest",
+    env: Environment, path: SampledPath, movers: Sequence["Mover"], request: "SweepRequest",
     where: Words, exclude: Words, pairs: Callable[[], Iterable["LinkPair"]] = tuple,
 ) -> Swept:  # fmt: skip
     """Sweep rigid bodies, and pairs of them, along one path."""
     with suppress(ConnectionLostError):
-        return _Sweep(env, way, movers, asked).swept(where, exclude, pairs())
-    return _Sweep(env, way, movers, asked).swept(where, exclude, pairs())
+        return _Sweep(env, path, movers, request).swept(where, exclude, pairs())
+    return _Sweep(env, path, movers, request).swept(where, exclude, pairs())
 
 
 class SweepRequest(NamedTuple):
@@ -132,7 +132,7 @@ def shape_of(part: Part) -> CollisionShape:
     )
 
 
-def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
+def center_of(tool: ToolSurface, about: ArrayLike | None) -> Floats:
     """Centre (3,) of turns: as given, or the middle of the tool's box."""
     if about is None:
         return np.asarray(0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0)))
@@ -145,28 +145,36 @@ def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
 class Mover(NamedTuple):
     """A rigid body on its own path.
 
-    body : name of a machine's link; ways (N,) : parameters of the given path at the poses of its
-    own, if they differ; frame : `world_from_frame` at a parameter of the given path, for a path in
-    the frame of another link.
+    body : name of a machine's link; parameters (N,) : parameters of the given path at the poses of
+    its own, if they differ; frame : `world_from_frame` at a parameter of the given path, for a path
+    in the frame of another link.
     """
 
-    tool: MovingSurface
-    way: ToolPath
+    tool: ToolSurface
+    path: ToolPath
     body: str = ""
-    ways: Floats | None = None
+    parameters: Floats | None = None
     frame: Callable[[float], Floats] | None = None
 
     def own(self, given: float) -> float:
         """Parameter of its own path, for one of the given path."""
-        return given if self.ways is None else float(np.interp(given, self.ways, self.way.ways))
+        return (
+            given
+            if self.parameters is None
+            else float(np.interp(given, self.parameters, self.path.parameters))
+        )
 
     def given(self, own: float) -> float:
         """First parameter of the given path, for one of its own."""
-        if self.ways is None:
+        if self.parameters is None:
             return own
-        n = int(np.searchsorted(self.way.ways, own))
-        is_there = n < len(self.ways) and self.way.ways[n] == own
-        return float(self.ways[n] if is_there else np.interp(own, self.way.ways, self.ways))
+        n = int(np.searchsorted(self.path.parameters, own))
+        is_there = n < len(self.parameters) and self.path.parameters[n] == own
+        return float(
+            self.parameters[n]
+            if is_there
+            else np.interp(own, self.path.parameters, self.parameters)
+        )
 
 
 class LinkPair(NamedTuple):
@@ -192,13 +200,13 @@ class _Sweep:
     """State of one sweep."""
 
     def __init__(
-        self, env: Environment, way: SampledPath, movers: Sequence[Mover], asked: SweepRequest
+        self, env: Environment, path: SampledPath, movers: Sequence[Mover], request: SweepRequest
     ) -> None:
         self._env, self._movers = env, movers
-        self._way, self._asked = way, asked
-        self._looks = 0
-        self._best = asked.limit
-        self._closed = asked.limit  # proved where nothing nearer was looked for
+        self._path, self._request = path, request
+        self._n_queries = 0
+        self._best = request.limit
+        self._closed = request.limit  # proved where nothing nearer was looked for
         self._nearest: PathPlace | None = None
         self._hits: list[PathPlace] = []
         self._contacts: list[_Touched] = []
@@ -211,16 +219,16 @@ class _Sweep:
         began, is_stopped = time.monotonic(), False
         with self._env.store.snapshot():
             revision = self._env.store.revision()
-            objects = self._env.felt(where, exclude)
+            objects = self._env.select(where, exclude)
             try:
                 for mover, obj, shape in pairs:
-                    self._look_at(mover, obj, shape, is_inside=True)
+                    self._measure_object(mover, obj, shape, is_inside=True)
                 near = self._decide(objects)
                 self._follow()
             except OverTimeError:
                 near, is_stopped = len(objects), True
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
-        hits = hits[:1] if self._asked.until_hit else hits
+        hits = hits[:1] if self._request.until_hit else hits
         at_least = max(min(self._closed, self._best - self._error), 0.0)
         gap = Gap(at_least, self._best, self._nearest, self._error)
         if hits or self._enclosed:
@@ -228,10 +236,10 @@ class _Sweep:
         elif is_stopped:
             gap = gap._replace(at_least=0.0)
         return Swept(
-            path=self._way, gap=gap, hits=hits, touching=tuple(map(self._told, self._contacts)),
+            path=self._path, gap=gap, hits=hits, touching=tuple(map(self._touched, self._contacts)),
             enclosed=tuple(self._enclosed), undecided=tuple(self._undecided),
-            contact=self._asked.contact, overlap=self._asked.overlap, objects=near,
-            looks=self._looks + sum(one.pair.looks for one in self._contacts),
+            contact=self._request.contact, overlap=self._request.overlap, objects=near,
+            queries=self._n_queries + sum(one.pair.queries for one in self._contacts),
             revision=revision, elapsed=time.monotonic() - began,
             is_stopped=is_stopped,
         )  # fmt: skip
@@ -241,7 +249,7 @@ class _Sweep:
         least_gaps, is_inside = self._box_gaps(objects)
         nearest = least_gaps.min(axis=0, initial=np.inf)
         order = np.argsort(nearest, kind="stable").tolist()
-        n_near = int((nearest < self._asked.limit).sum())
+        n_near = int((nearest < self._request.limit).sum())
         parts = parts_of(self._env.store, [objects[i] for i in order])
         for n, i in enumerate(order):
             least = float(nearest[i])
@@ -255,14 +263,14 @@ class _Sweep:
                 if least >= self._wanted():
                     self._closed = min(self._closed, least)
                 elif self._is_near(mover, obj):
-                    self._look_at(mover, obj, shape, is_inside=bool(is_inside[n_mover, i]))
-            if self._asked.progress is not None:
-                self._asked.progress(n + 1, n_near)
+                    self._measure_object(mover, obj, shape, is_inside=bool(is_inside[n_mover, i]))
+            if self._request.progress is not None:
+                self._request.progress(n + 1, n_near)
         return len(objects)
 
     def _box_gaps(self, objects: list[Object]) -> tuple[Floats, NDArray[np.bool_]]:
         """Least distances (L, O) of each mover's box, and whether it meets them at the start."""
-        found = [box_gaps(one.tool, one.way, objects)[1] for one in self._movers]
+        found = [box_gaps(one.tool, one.path, objects)[1] for one in self._movers]
         return (
             np.array([gaps.min(axis=1, initial=np.inf) for gaps in found]),
             np.array([gaps[:, 0] <= 0.0 for gaps in found]),
@@ -270,18 +278,18 @@ class _Sweep:
 
     def _is_near(self, mover: Mover, obj: Object) -> bool:
         """Whether the boxes come near each other before the path's end of interest."""
-        if self._end >= self._way.length:
+        if self._end >= self._path.length:
             return True
-        edges, gaps = box_gaps(mover.tool, mover.way, [obj])
+        edges, gaps = box_gaps(mover.tool, mover.path, [obj])
         return bool(gaps[0, edges[:-1] <= mover.own(self._end)].min() < self._wanted())
 
     @property
     def _end(self) -> float:
         """Last path parameter of interest."""
-        if not (self._asked.until_hit and (self._hits or self._enclosed)):
-            return self._way.length
+        if not (self._request.until_hit and (self._hits or self._enclosed)):
+            return self._path.length
         first = min((place.fraction for place in self._hits), default=0.0)
-        return 0.0 if self._enclosed else first * self._way.length
+        return 0.0 if self._enclosed else first * self._path.length
 
     def _wanted(self) -> float:
         """Greatest distance with an effect on the result."""
@@ -289,20 +297,20 @@ class _Sweep:
             return 2.0 * MEETING
         return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
 
-    def _look_at(
+    def _measure_object(
         self, mover: Mover, obj: Object, shape: CollisionShape, *, is_inside: bool
     ) -> None:
         """Decide about one object; is_inside : whether its box meets the mover's at the start.
 
         A contact is only followed a little at first: most hits are there.
         """
-        tool, way = mover.tool, mover.way
+        tool, path = mover.tool, mover.path
         error = shape.chord + tool.chord
         pair = Pair(
-            shape.tree, tool, way, self._asked.until, mover.own(self._end), error,
-            None if mover.ways is None else obj.bounds,
+            shape.tree, tool, path, self._request.until, mover.own(self._end), error,
+            None if mover.parameters is None else obj.bounds,
         )  # fmt: skip
-        contact, pose = self._asked.contact, way.at([0.0])[0]
+        contact, pose = self._request.contact, path.at([0.0])[0]
         gap = pair.measure(np.zeros(1), np.array([2.0 * contact]))
         apart = float(gap.at_least[0])
         is_touched = gap.at_most[0] <= contact
@@ -318,24 +326,24 @@ class _Sweep:
             self._touch(mover, obj, pair, shape, apart)
             return
         self._measure(mover, obj, pair, shape, 0.0)
-        self._looks += pair.looks
+        self._n_queries += pair.queries
 
     def _touch(
         self, mover: Mover, obj: Object, pair: Pair, shape: CollisionShape, gap: float
     ) -> None:
         """Begin a contact; gap : of the surfaces at the start of the path."""
-        is_fine = pair.error < self._asked.contact
+        is_fine = pair.error < self._request.contact
         found = self._contact(pair, shape, gap, pair.error if is_fine else -pair.error)
         if not is_fine:
             self._undecided.append(obj)
         self._contacts.append(_Touched(mover, obj, pair, shape, gap, found))
         if found.is_hit:
             self._note_hit(len(self._contacts) - 1)
-        self._advance(len(self._contacts) - 1, FIRST_SHARE * self._way.length)
+        self._advance(len(self._contacts) - 1, FIRST_SHARE * self._path.length)
 
     def _contact(self, pair: Pair, shape: CollisionShape, gap: float, error: float) -> Contact:
-        asked = self._asked
-        return Contact(pair, shape, asked.contact, gap, seated=asked.seated, error=error)
+        request = self._request
+        return Contact(pair, shape, request.contact, gap, seated=request.seated, error=error)
 
     def _follow(self) -> None:
         """Follow all contacts in the order of the path, then each object from its parting on."""
@@ -343,10 +351,10 @@ class _Sweep:
         while share < 1.0:
             share = min(LATER * share, 1.0)
             for n in range(len(self._contacts)):
-                self._advance(n, share * self._way.length)
+                self._advance(n, share * self._path.length)
         for mover, obj, pair, shape, _, found in self._contacts:
-            if found.is_apart and found.way < mover.own(self._end):
-                self._measure(mover, obj, pair, shape, found.way)
+            if found.is_apart and found.parameter < mover.own(self._end):
+                self._measure(mover, obj, pair, shape, found.parameter)
 
     def _advance(self, n: int, end: float) -> None:
         """Follow the n-th contact to a path parameter, and note a hit."""
@@ -368,13 +376,13 @@ class _Sweep:
                 return
         depth, place = found.depth()
         if not depth:
-            place = pair.nearest_at(pair.way.at([found.way])[0]).on_a[0]
-        self._hits.append(self._place(mover, obj, found.way, place, place, depth))
+            place = pair.nearest_at(pair.path.at([found.parameter])[0]).on_a[0]
+        self._hits.append(self._place(mover, obj, found.parameter, place, place, depth))
 
-    def _told(self, one: _Touched) -> TouchedObject:
+    def _touched(self, one: _Touched) -> TouchedObject:
         found = one.found
-        is_open = not found.is_over and found.way >= one.pair.way.length
-        until = 1.0 if is_open else self._way.fraction(one.mover.given(found.way))
+        is_open = not found.is_over and found.parameter >= one.pair.path.length
+        until = 1.0 if is_open else self._path.fraction(one.mover.given(found.parameter))
         return TouchedObject(
             one.object, found.start, found.start_at_least, found.reach, until, found.by,
             found.is_sliding, one.mover.body,
@@ -394,30 +402,32 @@ class _Sweep:
             self._closed = min(self._closed, closed - pair.error)
         if least is None:
             return
-        if pair.error and least.at_most <= pair.error and not self._is_met(pair, shape, least):
+        if pair.error and least.at_most <= pair.error and not self._collides(pair, shape, least):
             self._undecided.append(obj)
         elif least.at_most <= MEETING:
-            self._hits.append(self._place(mover, obj, least.way, least.on_tool, least.on_object))
+            self._hits.append(
+                self._place(mover, obj, least.parameter, least.on_tool, least.on_object)
+            )
         elif is_counted:
             self._best, self._error = least.at_most, pair.error
-            self._nearest = self._place(mover, obj, least.way, least.on_tool, least.on_object)
+            self._nearest = self._place(mover, obj, least.parameter, least.on_tool, least.on_object)
 
-    def _is_met(self, pair: Pair, shape: CollisionShape, least: Least) -> bool:
+    def _collides(self, pair: Pair, shape: CollisionShape, least: Least) -> bool:
         """Whether the true surfaces collide: an overlap beyond the chord errors soon after."""
-        way = min(least.way + BEYOND * pair.error, pair.way.length)
+        parameter = min(least.parameter + BEYOND * pair.error, pair.path.length)
         found = Separation(shape, pair.tool, pair.check_time)
-        return found.depth(pair.way.at([way])[0], pair.error)[0] > 0.0
+        return found.depth(pair.path.at([parameter])[0], pair.error)[0] > 0.0
 
     def _place(
-        self, mover: Mover, obj: Object, way: float, on_tool: Floats, on_object: Floats,
+        self, mover: Mover, obj: Object, parameter: float, on_tool: Floats, on_object: Floats,
         depth: float = 0.0,
     ) -> PathPlace:  # fmt: skip
-        given, pose = mover.given(way), mover.way.at([way])[0]
-        segment = int(self._way.segments(np.array([given]))[0])
+        given, pose = mover.given(parameter), mover.path.at([parameter])[0]
+        segment = int(self._path.segments(np.array([given]))[0])
         if mover.frame is not None:
             frame = mover.frame(given)
             pose = frame @ pose
             on_tool, on_object = (frame[:3, :3] @ at + frame[:3, 3] for at in (on_tool, on_object))
         return PathPlace(
-            obj, self._way.fraction(given), segment, pose, on_tool, on_object, depth, mover.body
+            obj, self._path.fraction(given), segment, pose, on_tool, on_object, depth, mover.body
         )

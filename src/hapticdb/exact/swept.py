@@ -104,7 +104,7 @@ class Swept(Tabular):
         The contact tolerance, and the overlap that is allowed at the start; metres.
     objects : int
         Number of objects near the path, whose surfaces were looked at.
-    looks : int
+    queries : int
         How often two surfaces were measured.
     revision : int
         Revision of the database that was read.
@@ -125,16 +125,16 @@ class Swept(Tabular):
     contact: float
     overlap: float
     objects: int
-    looks: int
+    queries: int
     revision: int
     elapsed: float
     is_stopped: bool = False
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        met = [obj.name for obj in (*(place.object for place in self.hits), *self.enclosed)]
-        found = f"by {', '.join(met[:3])}" if met else f"gap {length_text(self.gap.at_least)}"
-        more = f" and {len(met) - 3} more" if len(met) > 3 else ""
+        names = [obj.name for obj in (*(place.object for place in self.hits), *self.enclosed)]
+        found = f"by {', '.join(names[:3])}" if names else f"gap {length_text(self.gap.at_least)}"
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
         return f"Swept({self.verdict}, {found}{more}, {self.objects} objects, {self.elapsed:.2f} s)"
 
     def records(self) -> Iterator[dict[str, Any]]:

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from hapticdb.cluster.place import Whereabouts
-from hapticdb.cluster.workers import Cluster, connected
+from hapticdb.cluster.environment_address import EnvironmentAddress
+from hapticdb.cluster.scheduler import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.exact.separation import CONTACT
 from hapticdb.exact.sweep import sweep
-from hapticdb.extraction.result import Blocker, Extraction, ids_of
-from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
+from hapticdb.extraction.extraction_results import Blocker, Extraction, ids_of
+from hapticdb.extraction.removal_search import DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
@@ -172,36 +172,38 @@ def disassemble(
     if not (math.isfinite(seconds) and seconds > 0.0) or depth < 0:
         raise UsageError(f"{seconds} seconds, depth {depth}: give more than 0, and 0 or more")
     parts = tuple(env.find(*words))
-    stays = {*ids_of(parts), *ids_of(env.felt(where, exclude))}
-    left_out = tuple(obj.id for obj in env.objects() if obj.id not in stays)
+    stays = {*ids_of(parts), *ids_of(env.select(where, exclude))}
+    excluded = tuple(obj.id for obj in env.objects() if obj.id not in stays)
     kept = frozenset(ids_of(env.find(*keep)) if keep else ())
     options = {"out": out, "screw": screw, "contact": contact, "overlap": overlap, "seed": seed,
                "budget_bytes": budget_bytes, "progress": progress}  # fmt: skip
-    asked = _Asked(parts, left_out, kept, seconds, motions, options)
+    request = _Request(parts, excluded, kept, seconds, motions, options)
     with connected(on) as workers:
-        found = _ordered(env, asked, depth, workers)
+        found = _ordered(env, request, depth, workers)
     return replace(found, seconds=time.monotonic() - began)
 
 
-def _ordered(env: Environment, asked: "_Asked", depth: int, workers: Cluster | None) -> Disassembly:
+def _ordered(
+    env: Environment, request: "_Request", depth: int, workers: Cluster | None
+) -> Disassembly:
     """Search by straight pulls of the objects in the way, then with the planner; `seconds` is 0."""
-    search = _OrderSearch(env, asked, time.monotonic() + asked.seconds, workers)
+    search = _OrderSearch(env, request, time.monotonic() + request.seconds, workers)
     is_found = False
-    for motions in dict.fromkeys((0, asked.motions)):
+    for motions in dict.fromkeys((0, request.motions)):
         search.motions_of_others = motions
-        is_found = search.clear(asked.parts, depth, frozenset())
+        is_found = search.clear(request.parts, depth, frozenset())
         if is_found:
-            search.drop_needless()
+            search.drop_unneeded()
             break
     if not is_found and search.missing is not None:
         raise search.missing
     return Disassembly(
-        asked.parts, tuple(search.steps), tuple(search.failed),
-        not is_found and search.is_spent, 0.0, asked.options["seed"],
+        request.parts, tuple(search.steps), tuple(search.failed),
+        not is_found and search.is_spent, 0.0, request.options["seed"],
     )  # fmt: skip
 
 
-class _Asked(NamedTuple):
+class _Request(NamedTuple):
     """Options of all searches.
 
     parts : to be removed in the end; exclude : ids of the caller's exclusions but for `parts`,
@@ -217,7 +219,9 @@ class _Asked(NamedTuple):
     options: dict[str, Any]
 
 
-def _search_there(there: Whereabouts, ids: tuple[int, ...], options: dict[str, Any]) -> Extraction:
+def _search_there(
+    there: EnvironmentAddress, ids: tuple[int, ...], options: dict[str, Any]
+) -> Extraction:
     """Search for a removal path: the task of a worker."""
     with Environment(there.open()) as env:
         return extract(env, *ids, **options)
@@ -228,7 +232,7 @@ class _Known(NamedTuple):
 
     n_gone: int
     motions: int
-    met: frozenset[int]
+    obstacles: frozenset[int]
     failed: FailedSearch
 
 
@@ -241,14 +245,14 @@ class _OrderSearch:
     """
 
     def __init__(
-        self, env: Environment, asked: _Asked, until: float, workers: Cluster | None
+        self, env: Environment, request: _Request, until: float, workers: Cluster | None
     ) -> None:
         self.steps: list[Removal] = []
         self.failed: list[FailedSearch] = []
         self.motions_of_others = 0
         self.missing: MissingExtraError | None = None
         self.is_spent = False
-        self._env, self._asked, self._until = env, asked, until
+        self._env, self._request, self._until = env, request, until
         self._known: dict[tuple[int, ...], _Known] = {}
         self._workers = workers
         self._ahead: dict[tuple[object, ...], Any] = {}
@@ -294,8 +298,8 @@ class _OrderSearch:
         }
 
     def _candidates(self, failed: FailedSearch, waiting: frozenset[int]) -> Iterator[Object]:
-        left_out = waiting | self._gone() | self._asked.keep
-        blockers = [one.object for one in failed.blockers if one.object.id not in left_out]
+        excluded = waiting | self._gone() | self._request.keep
+        blockers = [one.object for one in failed.blockers if one.object.id not in excluded]
         for obj in blockers[:MOST_BLOCKERS]:
             if self._is_over():
                 return
@@ -311,17 +315,17 @@ class _OrderSearch:
 
     def _excluded(self) -> tuple[int, ...]:
         """Ids of all objects absent now."""
-        return (*self._asked.exclude, *sorted(self._gone()))
+        return (*self._request.exclude, *sorted(self._gone()))
 
     def _take_off(self, parts: tuple[Object, ...]) -> FailedSearch | None:
         """Search for a removal path, and remove the parts on it; return the failure without one."""
         ids = ids_of(parts)
-        is_wanted = ids == ids_of(self._asked.parts)
-        motions = self._asked.motions if is_wanted else self.motions_of_others
+        is_wanted = ids == ids_of(self._request.parts)
+        motions = self._request.motions if is_wanted else self.motions_of_others
         known = self._known.get(ids)
-        if known is not None and self._still_holds(known, motions):
+        if known is not None and self._would_fail_again(known, motions):
             return known.failed
-        n_gone, met = len(self.steps), frozenset[int]()
+        n_gone, obstacles = len(self.steps), frozenset[int]()
         excluded = self._excluded()
         try:
             if not is_wanted:
@@ -336,12 +340,12 @@ class _OrderSearch:
                 self.steps.append(Removal(found, tuple(sorted({*ids, *excluded}))))
                 return None
             failed = FailedSearch(parts, n_gone, found.verdict, found.blockers)
-            met |= {*ids_of([one.object for one in failed.blockers]), *ids_of(found.near)}
-        self._known[ids] = _Known(n_gone, motions, met, failed)
+            obstacles |= {*ids_of([one.object for one in failed.blockers]), *ids_of(found.near)}
+        self._known[ids] = _Known(n_gone, motions, obstacles, failed)
         self.failed.append(failed)
         return failed
 
-    def _still_holds(self, known: _Known, motions: int) -> bool:
+    def _would_fail_again(self, known: _Known, motions: int) -> bool:
         """Whether a search would fail again, after the removals since.
 
         A pull ends at the first object in its way. While all these objects stand, pulls end at the
@@ -353,14 +357,14 @@ class _OrderSearch:
             return False
         if motions:
             return known.n_gone == len(self.steps)
-        return not any(known.met & {*step.ids} for step in self.steps[known.n_gone :])
+        return not any(known.obstacles & {*step.ids} for step in self.steps[known.n_gone :])
 
     def _check_something_stands(self, excluded: set[int]) -> None:
         """Refuse to remove the last object other than the requested parts.
 
         Of two bodies, each comes out of the other or neither does.
         """
-        excluded |= {*ids_of(self._asked.parts)}
+        excluded |= {*ids_of(self._request.parts)}
         if all(obj.id in excluded for obj in self._env.objects()):
             raise UsageError("it is the last object that stands beside what is to come out")
 
@@ -373,7 +377,7 @@ class _OrderSearch:
                 task or self._given(self._workers, ids, motions)
             )
             self._n_searched += 1
-            if (progress := self._asked.options["progress"]) is not None:
+            if (progress := self._request.options["progress"]) is not None:
                 progress(self._n_searched, self._n_searched + len(self._ahead))
             return found
 
@@ -386,17 +390,17 @@ class _OrderSearch:
 
     def _options(self, motions: int) -> dict[str, Any]:
         """Options of a search that begins now."""
-        left = min(self._until - time.monotonic(), SHARE * self._asked.seconds)
+        left = min(self._until - time.monotonic(), SHARE * self._request.seconds)
         now = {"exclude": self._excluded(), "seconds": max(left, LEAST), "motions": motions}
-        return self._asked.options | now
+        return self._request.options | now
 
     def _given(self, workers: Cluster, ids: tuple[int, ...], motions: int) -> Any:  # noqa: ANN401 - dask's future
         """Submit a search to the workers."""
-        there = Whereabouts.of(self._env.store, self._env.address)
+        there = EnvironmentAddress.of(self._env.store, self._env.address)
         options = self._options(motions) | {"progress": None}
         return workers.submit(partial(_search_there, there, ids, options))
 
-    def drop_needless(self) -> None:
+    def drop_unneeded(self) -> None:
         """Drop steps without which all later ones are proved as well, from last to first."""
         for n in range(len(self.steps) - 2, -1, -1):
             if time.monotonic() > self._until:
@@ -412,15 +416,15 @@ class _OrderSearch:
         """
         proved: list[Removal] = []
         for step in reversed(self.steps[n + 1 :]):
-            found, way = step.found, step.found.way
-            assert way is not None  # noqa: S101 - steps are proved
+            found, path = step.found, step.found.path
+            assert path is not None  # noqa: S101 - steps are proved
             excluded = tuple(i for i in step.excluded if i not in self.steps[n].ids)
             left = max(self._until - time.monotonic(), LEAST)
             again = sweep(
-                self._env, found.shell, way.poses, exclude=excluded, contact=way.swept.contact,
-                overlap=way.swept.overlap, seated=True, seconds=left,
+                self._env, found.shell, path.poses, exclude=excluded, contact=path.swept.contact,
+                overlap=path.swept.overlap, seated=True, seconds=left,
             )  # fmt: skip
             if not again.is_free:
                 return None
-            proved.append(Removal(replace(found, way=replace(way, swept=again)), excluded))
+            proved.append(Removal(replace(found, path=replace(path, swept=again)), excluded))
         return proved[::-1]

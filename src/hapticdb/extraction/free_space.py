@@ -41,7 +41,7 @@ class Room:
         self.n_poses = 0
         self._frames, self._problem = frames, problem
 
-    def ways(self, path: SampledPath) -> Floats:
+    def parameters(self, path: SampledPath) -> Floats:
         """Path parameters (n,), at most `STEP` voxels apart."""
         steps = path.length / (STEP * self._problem.voxel_size)
         return np.linspace(0.0, path.length, 1 + max(int(np.ceil(steps)), 1))
@@ -49,7 +49,7 @@ class Room:
     def hits(self, poses: Floats) -> Ints:
         """Numbers (n,) of points in occupied voxels at poses (n, 4, 4)."""
         self.n_poses += len(poses)
-        return self._frames.feel(poses).hits
+        return self._frames.evaluate(poses).hits
 
     def are_free(self, poses: Floats) -> NDArray[np.bool_]:
         """Whether poses (n, 4, 4) have no hits; ends at the first hit, so faster than `hits`."""
@@ -57,15 +57,15 @@ class Room:
         return ~self._frames.collides(poses)
 
     def _between(self, ends: Floats) -> Floats:
-        """Poses (n, 4, 4) between two poses (2, 4, 4), as in `ways`; faster without a turn."""
+        """Poses (n, 4, 4) between two poses (2, 4, 4), as in `parameters`; a shift is faster."""
         if not np.array_equal(ends[0, :3, :3], ends[1, :3, :3]):
             path = self._problem.path(ends)
-            return path.at(self.ways(path))
-        way = ends[1, :3, 3] - ends[0, :3, 3]
-        steps = float(np.linalg.norm(way)) / (STEP * self._problem.voxel_size)
+            return path.at(self.parameters(path))
+        shift = ends[1, :3, 3] - ends[0, :3, 3]
+        steps = float(np.linalg.norm(shift)) / (STEP * self._problem.voxel_size)
         shares = np.linspace(0.0, 1.0, 1 + max(int(np.ceil(steps)), 1))
         poses = np.tile(ends[0], (len(shares), 1, 1))
-        poses[:, :3, 3] += shares[:, None] * way
+        poses[:, :3, 3] += shares[:, None] * shift
         return poses
 
     def farthest(self, ends: Floats) -> Floats:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AXES, likely_directions
 from hapticdb.extraction.free_space import FreeSpace, Room
-from hapticdb.extraction.judge import passed
 from hapticdb.extraction.problem import Exit, Problem
+from hapticdb.extraction.proof import passed
 from hapticdb.extraction.pulls import Pulls, first_run, shifted
 from hapticdb.grid import corners_of
 
@@ -98,13 +98,15 @@ class GoalsOutside:
             across = shift - (shift @ direction) * direction
             place = self._outside(corners, direction, across, turn)
             center = turn @ self._problem.center + place[:3, 3]
-            way = float((center - self._problem.center) @ direction)
-            out = self._placed(turn, center - self._problem.center + (length - way) * direction)
-            if way >= length or not self._leaving.is_out(self._problem.shift(out)[None])[0]:
+            distance = float((center - self._problem.center) @ direction)
+            out = self._placed(
+                turn, center - self._problem.center + (length - distance) * direction
+            )
+            if distance >= length or not self._leaving.is_out(self._problem.shift(out)[None])[0]:
                 continue  # the hull extends as far as all objects
             if room.is_motion_free(np.stack([place, out])):
                 deepest = place.copy()
-                deepest[:3, 3] -= way * direction
+                deepest[:3, 3] -= distance * direction
                 goal = room.farthest(np.stack([place, deepest]))
                 found.append(goal)
                 self._exits.append((goal, out[None]))
@@ -115,8 +117,8 @@ class GoalsOutside:
         problem = self._problem
         placed = (problem.shell.points - problem.center) @ (turn.T @ direction)
         reach = float((corners @ direction).max()) + ROOM * problem.voxel_size - float(placed.min())
-        way = max(reach - float(problem.center @ direction), 0.0)
-        return self._placed(turn, across + way * direction)
+        distance = max(reach - float(problem.center @ direction), 0.0)
+        return self._placed(turn, across + distance * direction)
 
     def _placed(self, turn: Floats, shift: Floats) -> Floats:
         """Displacement (4, 4): a rotation about the part's centre, then a shift."""
@@ -177,9 +179,9 @@ class GoalPose:
         return found
 
 
-def _led_on(pose: Floats, ways: list[tuple[Floats, Floats]]) -> Floats:
+def _led_on(pose: Floats, paths: list[tuple[Floats, Floats]]) -> Floats:
     """The rest (n, 4, 4) of the path that begins at a pose (4, 4); empty without one."""
-    for place, rest in ways:
+    for place, rest in paths:
         if np.allclose(place, pose, atol=SAME):
             return rest
     return np.empty((0, 4, 4))

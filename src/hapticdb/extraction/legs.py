@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.extraction.contact_escape import EscapePath
 from hapticdb.extraction.directions import AXES
 from hapticdb.extraction.free_space import Room
-from hapticdb.extraction.loosening import Loosened
 from hapticdb.extraction.problem import Exit, Problem
 
 Floats = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Legs(NamedTuple):
     leaving: Exit
     until: float
 
-    def search(self, starts: list[Loosened]) -> tuple[Loosened, Floats] | None:
+    def search(self, starts: list[EscapePath]) -> tuple[EscapePath, Floats] | None:
         """A start, and a path (M, 4, 4) to its end or a stop before it, then one or two legs out.
 
         One leg from all ends comes first, then two legs, then also stops on the path to each start.
@@ -62,7 +62,7 @@ class Legs(NamedTuple):
                 return start, np.concatenate([poses, out[None]])
         return None
 
-    def _tries(self, starts: list[Loosened]) -> Iterator[tuple[Loosened, Floats, Floats]]:
+    def _tries(self, starts: list[EscapePath]) -> Iterator[tuple[EscapePath, Floats, Floats]]:
         """Starts, paths (M, 4, 4) to a stop, and axes (3,) of the last leg."""
         for start in starts:
             for axis in AXES:
@@ -70,29 +70,29 @@ class Legs(NamedTuple):
         for n_stops in STOPS:
             for start in starts:
                 for stop in self._stops(start.poses[-2], start.poses[-1], n_stops):
-                    way = np.concatenate([start.poses[:-1], stop[None]])
+                    path = np.concatenate([start.poses[:-1], stop[None]])
                     for axis in AXES:
                         for last in self._along(stop, axis, n_stops):
-                            longer = np.concatenate([way, last[None]])
+                            longer = np.concatenate([path, last[None]])
                             for out in AXES[np.abs(AXES @ axis) < 0.5]:
                                 yield start, longer, out
 
     def _end(self, here: Floats, axis: Floats) -> Floats:
         """Displacement (4, 4) straight on along an axis until the part is out."""
         shift = self.problem.shift(here)
-        way = float(self.leaving.distances(axis[None])[0]) - float(shift @ axis)
+        distance = float(self.leaving.distances(axis[None])[0]) - float(shift @ axis)
         out = here.copy()
-        out[:3, 3] += max(way, 0.0) * axis
+        out[:3, 3] += max(distance, 0.0) * axis
         return out
 
     def _along(self, here: Floats, axis: Floats, n_stops: int) -> Floats:
         """Stops (n, 4, 4) on the free leg along an axis; none if it is shorter than a voxel."""
         ends = np.stack([here, self._end(here, axis)])
         last = self.room.farthest(ends)
-        way = float(np.linalg.norm(last[:3, 3] - here[:3, 3]))
-        if way < self.problem.voxel_size:
+        distance = float(np.linalg.norm(last[:3, 3] - here[:3, 3]))
+        if distance < self.problem.voxel_size:
             return np.empty((0, 4, 4))
-        wanted = math.ceil(way / (BETWEEN * self.problem.radius))
+        wanted = math.ceil(distance / (BETWEEN * self.problem.radius))
         return _between(here, last, max(n_stops, min(wanted, MOST_STOPS)))
 
     def _stops(self, begin: Floats, end: Floats, n_stops: int) -> Floats:
@@ -103,7 +103,7 @@ class Legs(NamedTuple):
         return np.asarray(stops[self.room.are_free(stops)])
 
 
-def _is_along_axis(start: Loosened) -> bool:
+def _is_along_axis(start: EscapePath) -> bool:
     """Whether the last leg to a start is parallel to an axis."""
     shift = start.poses[-1, :3, 3] - start.poses[-2, :3, 3]
     return bool(np.abs(shift).max() >= 0.999 * np.linalg.norm(shift))

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError
+from hapticdb.extraction.contact_escape import ContactEscape, EscapePath
 from hapticdb.extraction.free_space import FreeSpace, Room
 from hapticdb.extraction.goals import SAME, Goals
-from hapticdb.extraction.judge import BACK
 from hapticdb.extraction.legs import Legs
-from hapticdb.extraction.loosening import Loosened, Loosening
 from hapticdb.extraction.planner_child import PlanRequest
 from hapticdb.extraction.problem import Exit, Problem
+from hapticdb.extraction.proof import BACK
 from hapticdb.extraction.pulls import Pulls, first_run
 from hapticdb.poses import quaternion_of, rotation_of
 from hapticdb.session.processes.process import Process
@@ -38,7 +38,7 @@ SHARE_OF_SHIFTS = 0.3
 SHARE_OF_LEGS = 0.3
 """Greatest share of the time for straight legs along the axes; these are no queries of the
 planner."""
-SHARE_OF_LOOSENING = 0.2
+SHARE_OF_ESCAPES = 0.2
 """Share of queries and time for motions out of contact, if no pull is free. Larger: longer paths
 out of contact, less for the planner."""
 MOST_TURNS = 8
@@ -84,17 +84,17 @@ class Planner:
         self._problem, self._space = problem, space
         self._pulls, self._goals, self._leaving = pulls, goals, leaving
         self._seed, self._most, self._until = seed, most_motions, until
-        self._starts: list[Loosened] | None = None
-        self._used: Loosened | None = None
+        self._starts: list[EscapePath] | None = None
+        self._used: EscapePath | None = None
         self.n_motions = 0
 
     @property
-    def can_refuse(self) -> bool:
+    def can_reject(self) -> bool:
         """Whether another start remains after that of the last path, with queries and time."""
         is_left = self._starts is not None and len(self._starts) > 1
         return is_left and self.n_motions < self._most and time.monotonic() < self._until
 
-    def refuse(self) -> None:
+    def reject_start(self) -> None:
         """Drop the start of the last path, because its first part is refuted."""
         self._starts = [one for one in self._starts or [] if one is not self._used]
 
@@ -121,7 +121,7 @@ class Planner:
                 return path
         return None
 
-    def _by_legs(self, leaving: Exit, wide: list[Loosened]) -> Floats | None:
+    def _by_legs(self, leaving: Exit, wide: list[EscapePath]) -> Floats | None:
         """Path (M, 4, 4) out by straight legs along axes, from starts in the wide space if any."""
         room = self._space.wide if wide else self._space.room
         until = self._part(SHARE_OF_LEGS).until
@@ -136,19 +136,19 @@ class Planner:
         now, left = time.monotonic(), max(self._most - self.n_motions, 0)
         return _Share(max(int(share * left), 1), now + share * (self._until - now))
 
-    def _in_room(self, room: Room, starts: list[Loosened], part: _Share) -> Floats | None:
+    def _in_room(self, room: Room, starts: list[EscapePath], part: _Share) -> Floats | None:
         """Path from one of the starts, in one space: by shifts alone, then with turns."""
-        now, asked = time.monotonic(), self.n_motions
+        now, before = time.monotonic(), self.n_motions
         soon = _Share(
             max(int(SHARE_OF_SHIFTS * part.motions), 1), now + SHARE_OF_SHIFTS * (part.until - now)
         )
-        path = self._ask(room, starts[:MOST_STARTS], 0.0, soon)
+        path = self._plan(room, starts[:MOST_STARTS], 0.0, soon)
         if path is not None:
             return path
-        left = part._replace(motions=max(part.motions - (self.n_motions - asked), 1))
-        return self._ask(room, starts[:MOST_STARTS], self._problem.radius, left)
+        left = part._replace(motions=max(part.motions - (self.n_motions - before), 1))
+        return self._plan(room, starts[:MOST_STARTS], self._problem.radius, left)
 
-    def _found_starts(self) -> list[Loosened]:
+    def _found_starts(self) -> list[EscapePath]:
         """Paths to the planner's starts: pulls; if none ends in the wide space, others, too.
 
         The start of a pull is the end of its first free run; the longest pulls come first. The
@@ -157,33 +157,33 @@ class Planner:
         """
         here = np.eye(4)[None]
         if self._leaving is None and self._space.wide.are_free(here)[0]:
-            return [Loosened(here, is_wide=True)]
-        found: list[tuple[float, Loosened]] = []
+            return [EscapePath(here, is_wide=True)]
+        found: list[tuple[float, EscapePath]] = []
         for pull in self._pulls.done:
             farthest = pull.free - BACK * self._problem.voxel_size
-            is_told = pull.is_swept or pull.touching <= LEAVING * self._problem.voxel_size
+            is_told = pull.is_swept or pull.contact_length <= LEAVING * self._problem.voxel_size
             if farthest <= 0.0 or not is_told:
                 continue
             path = self._problem.path(pull.poses(np.array([0.0, farthest])))
-            ways = self._space.room.ways(path)
-            poses = path.at(ways)
+            parameters = self._space.room.parameters(path)
+            poses = path.at(parameters)
             for room in (self._space.wide, self._space.room):
                 first, last = first_run(room.are_free(poses))
                 if first < last:
-                    way = np.stack([np.eye(4), poses[last - 1]])
+                    escape = np.stack([np.eye(4), poses[last - 1]])
                     is_wide = room is self._space.wide
-                    found.append((float(ways[last - 1]), Loosened(way, is_wide)))
+                    found.append((float(parameters[last - 1]), EscapePath(escape, is_wide)))
                     break
         starts = [one for _, one in sorted(found, key=lambda one: -one[0])]
         if self._space.start.objects and not any(one.is_wide for one in starts):
-            part = self._part(SHARE_OF_LOOSENING)
-            loosening = Loosening(self._problem, self._space, self._seed)
+            part = self._part(SHARE_OF_ESCAPES)
+            loosening = ContactEscape(self._problem, self._space, self._seed)
             starts += loosening.search(part.motions, part.until)
             self.n_motions += loosening.n_motions
         return starts
 
-    def _ask(
-        self, room: Room, starts: list[Loosened], turning: float, part: _Share
+    def _plan(
+        self, room: Room, starts: list[EscapePath], turning: float, part: _Share
     ) -> Floats | None:
         """Plan in a process; returns displacements (M, 4, 4) from the start, or None.
 
@@ -201,10 +201,10 @@ class Planner:
         if not len(goals):
             return None
         first, last = self._rows(np.stack([one.poses[-1] for one in starts])), self._rows(goals)
-        held = np.concatenate([first[:, :3], last[:, :3], self._goals.corners])
+        ends = np.concatenate([first[:, :3], last[:, :3], self._goals.corners])
         margin = self._problem.voxel_size
         request = PlanRequest(
-            first, last, held.min(axis=0) - margin, held.max(axis=0) + margin, turning,
+            first, last, ends.min(axis=0) - margin, ends.max(axis=0) + margin, turning,
             STRIDE * self._problem.radius, self._seed, part.motions,
         )  # fmt: skip
         rows = self._answer(room, request, turn, part.until)
@@ -247,7 +247,7 @@ class Planner:
         return poses
 
     def _path(
-        self, rows: Floats, turn: Floats | None, starts: list[Loosened], first: Floats
+        self, rows: Floats, turn: Floats | None, starts: list[EscapePath], first: Floats
     ) -> Floats:
         """Whole path of displacements (M, 4, 4): to the planner's start, along its states, on."""
         off = np.abs(first[:, :3] - rows[0, :3]).max(axis=1)

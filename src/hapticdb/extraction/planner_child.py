@@ -113,11 +113,11 @@ class _Search:
     def _motion_validator(self) -> Any:  # noqa: ANN401 - OMPL has no types
         search, validator = self, self._base.MotionValidator
 
-        class AskingValidator(validator):  # type: ignore[misc, valid-type]
+        class QueryValidator(validator):  # type: ignore[misc, valid-type]
             def checkMotion(self, start: Any, end: Any) -> bool:  # noqa: ANN401, N802 - OMPL's name
                 return search._is_free(start, end)
 
-        return AskingValidator(self._info)
+        return QueryValidator(self._info)
 
     def _is_free(self, start: Any, end: Any) -> bool:  # noqa: ANN401
         """Query the search whether a motion is free; False once the queries are spent."""

@@ -83,8 +83,8 @@ def problem_of(
     a part is a point cloud, or nothing else stands.
     """
     parts = env.find(*words)
-    left_out: tuple[int | str, ...] = (*(obj.id for obj in parts), *exclude)
-    standing = env.felt(where, left_out)
+    excluded: tuple[int | str, ...] = (*(obj.id for obj in parts), *exclude)
+    standing = env.select(where, excluded)
     if not standing:
         raise UsageError(f"nothing stands in {env.url} beside what is to come out")
     shell = env.shell(
@@ -96,7 +96,7 @@ def problem_of(
     center = box.mean(axis=0)
     radius = float(np.linalg.norm(outline - center, axis=1).max())
     return Problem(
-        env, tuple(parts), tuple(where), left_out, contact, overlap, tuple(standing),
+        env, tuple(parts), tuple(where), excluded, contact, overlap, tuple(standing),
         _box_of(standing), shell, corners_of(box), center, radius,
     )  # fmt: skip
 
@@ -135,9 +135,9 @@ class Exit(NamedTuple):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             up = (self.high + self.radius - self.center) / directions
             down = (self.low - self.radius - self.center) / directions
-        ways = np.where(directions > 0.0, up, np.where(directions < 0.0, down, np.inf))
-        ways = np.maximum(ways.min(axis=1), 0.0)
-        return np.asarray(ways if self.out is None else np.minimum(ways, self.out))
+        distances = np.where(directions > 0.0, up, np.where(directions < 0.0, down, np.inf))
+        distances = np.maximum(distances.min(axis=1), 0.0)
+        return np.asarray(distances if self.out is None else np.minimum(distances, self.out))
 
     def is_out(self, shifts: Floats) -> NDArray[np.bool_]:
         """Whether the part is out after shifts (n, 3) of its centre, metres."""

@@ -15,10 +15,10 @@ from hapticdb.extraction.directions import (
     likely_directions,
     opposed_shares,
 )
+from hapticdb.extraction.extraction_results import RemovalPath, ids_of
 from hapticdb.extraction.free_space import STEP, FreeSpace
-from hapticdb.extraction.judge import judge
 from hapticdb.extraction.problem import Exit, Problem
-from hapticdb.extraction.result import WayOut, ids_of
+from hapticdb.extraction.proof import prove
 from hapticdb.store.base import Progress
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ BLOCKS = (8, 64)
 class Pull(NamedTuple):
     """A straight pull.
 
-    direction (3,) : unit vector; length : metres until the part is out; touching : metres in
+    direction (3,) : unit vector; length : metres until the part is out; contact_length : metres in
     contact with the objects touched at the start; free : metres until the first other hit, `length`
     without one; blockers : ids of the objects at the first hit; is_swept : measured on surfaces,
     not voxels.
@@ -47,7 +47,7 @@ class Pull(NamedTuple):
 
     direction: Floats
     length: float
-    touching: float
+    contact_length: float
     free: float
     blockers: tuple[int, ...]
     is_swept: bool = False
@@ -57,9 +57,9 @@ class Pull(NamedTuple):
         """Whether the pull is free until the part is out."""
         return self.free >= self.length
 
-    def poses(self, ways: Floats) -> Floats:
+    def poses(self, distances: Floats) -> Floats:
         """Displacements (n, 4, 4) after (n,) metres."""
-        return poses_along(self.direction, ways)
+        return poses_along(self.direction, distances)
 
 
 class Pulls:
@@ -94,7 +94,7 @@ class Pulls:
             if progress is not None:
                 progress(len(self.done), total)
 
-    def sweep(self, until: float) -> WayOut | None:
+    def sweep(self, until: float) -> RemovalPath | None:
         """Sweep likely pulls until one is free; None without one, or at a time of `time.monotonic`.
 
         Axes come first, then directions with few opposing contacts, shorter pulls first.
@@ -109,39 +109,41 @@ class Pulls:
             direction, length = self._directions[n], float(self._lengths[n])
             now = time.monotonic()
             poses = poses_along(direction, np.array([0.0, length]))
-            way = judge(self._problem, poses, "pull", now + SHARE_OF_PULL * max(until - now, 0.0))
-            if not (way.in_way or way.swept.is_free):
+            proved = prove(
+                self._problem, poses, "pull", now + SHARE_OF_PULL * max(until - now, 0.0)
+            )
+            if not (proved.obstacles or proved.swept.is_free):
                 continue  # undecided: out of time
             self._swept.add(n)
-            blockers = ids_of(way.in_way[:1])  # it ends at the first
-            free = way.free_share * length
+            blockers = ids_of(proved.obstacles[:1])  # it ends at the first
+            free = proved.free_share * length
             self.done.append(Pull(direction, length, 0.0, free, blockers, is_swept=True))
-            if way.swept.is_free:
-                return way
+            if proved.swept.is_free:
+                return proved
         return None
 
     def _pull(self, n: int) -> Pull:
         direction, length = self._directions[n], float(self._lengths[n])
-        touching, free, blockers = 0.0, 0.0, self._opposing(direction)
+        contact_length, free, blockers = 0.0, 0.0, self._opposing(direction)
         if self._opposed[n] <= MOST_OPPOSED:  # else blocked at the start
-            ways = np.linspace(0.0, length, int(np.ceil(length / self._step)) + 1)
-            contact, end = self._followed(direction, ways)
-            if contact == len(ways):  # in contact all the way
-                touching, blockers = length, ids_of(self._space.start.objects)
+            distances = np.linspace(0.0, length, int(np.ceil(length / self._step)) + 1)
+            contact, end = self._followed(direction, distances)
+            if contact == len(distances):  # in contact all the way
+                contact_length, blockers = length, ids_of(self._space.start.objects)
             else:
-                touching = float(ways[contact]) if contact < end else 0.0
-                free = float(ways[end - 1]) * (end > contact)
+                contact_length = float(distances[contact]) if contact < end else 0.0
+                free = float(distances[end - 1]) * (end > contact)
                 blockers = ()
-                if end < len(ways):
-                    hit = self._space.touch(shifted(direction * ways[end]))
+                if end < len(distances):
+                    hit = self._space.touch(shifted(direction * distances[end]))
                     blockers = ids_of(hit.objects)
-        return Pull(direction, length, touching, free, blockers)
+        return Pull(direction, length, contact_length, free, blockers)
 
-    def _followed(self, direction: Floats, ways: Floats) -> tuple[int, int]:
+    def _followed(self, direction: Floats, distances: Floats) -> tuple[int, int]:
         """Numbers of the poses in contact from the start and before a hit, after (n,) metres."""
         contact, most, room = 0, -1.0, self._space.room
-        for first, end in _blocks(len(ways)):
-            poses = poses_along(direction, ways[first:end])
+        for first, end in _blocks(len(distances)):
+            poses = poses_along(direction, distances[first:end])
             slides = 0
             if contact == first:
                 hits = room.hits(poses)
@@ -154,7 +156,7 @@ class Pulls:
             later = np.flatnonzero(is_hit[slides:])
             if len(later):
                 return contact, first + slides + int(later[0])
-        return contact, len(ways)
+        return contact, len(distances)
 
     def _opposing(self, direction: Floats) -> tuple[int, ...]:
         """Ids of the objects with contacts at the start opposed to a direction."""
@@ -186,8 +188,8 @@ def shifted(shift: Floats) -> Floats:
     return np.asarray(poses_along(shift, np.ones(1))[0])
 
 
-def poses_along(direction: Floats, ways: Floats) -> Floats:
+def poses_along(direction: Floats, distances: Floats) -> Floats:
     """Poses (n, 4, 4) of shifts by (n,) metres in a direction (3,)."""
-    poses = np.tile(np.eye(4), (len(ways), 1, 1))
-    poses[:, :3, 3] = ways[:, None] * direction
+    poses = np.tile(np.eye(4), (len(distances), 1, 1))
+    poses[:, :3, 3] = distances[:, None] * direction
     return poses

@@ -1,6 +1,6 @@
 """Results of searches in one line."""
 
-from hapticdb.exact.report import (
+from hapticdb.exact.sweep_report import (
     MOST_NAMED,
     gap_text,
     names_of,
@@ -9,7 +9,7 @@ from hapticdb.exact.report import (
     verdict_line,
 )
 from hapticdb.extraction.disassembly import Disassembly, FailedSearch
-from hapticdb.extraction.result import Extraction, WayOut
+from hapticdb.extraction.extraction_results import Extraction, RemovalPath
 from hapticdb.store.base import Object
 from hapticdb.units import length_text
 from hapticdb.verdicts import PathVerdict
@@ -17,28 +17,28 @@ from hapticdb.verdicts import PathVerdict
 
 def extraction_line(found: Extraction) -> str:
     """Verdict, path and proof of a search, or the objects in the way, in one line."""
-    way = found.way
-    if way is None:
-        return _no_way(found)
+    removal = found.path
+    if removal is None:
+        return _no_path(found)
     hows = {"pull": "straight", "screw": "by a screw motion"}
-    how = hows.get(way.how, f"by {len(way.poses)} poses")
-    path = f"{how}, {length_text(way.length)}"
+    how = hows.get(removal.how, f"by {len(removal.poses)} poses")
+    path = f"{how}, {length_text(removal.length)}"
     if not found.is_free:
-        return f"not decided: a path {path} long: {verdict_line(way.swept, found.shell)}"
-    does = "comes out" if way.swept.comes_out else "slides"
+        return f"not decided: a path {path} long: {verdict_line(removal.swept, found.shell)}"
+    does = "comes out" if removal.swept.comes_out else "slides"
     does = does if found.to is None else "reaches the pose"
-    return f"{does} {path}{overlaps_text(way.swept)}{_proved(way)}"
+    return f"{does} {path}{overlaps_text(removal.swept)}{_proved(removal)}"
 
 
-def _proved(way: WayOut) -> str:
+def _proved(removal: RemovalPath) -> str:
     """Least distance of the surfaces, and touched objects with the ends of their contacts."""
-    swept, gap = way.swept, gap_text(way.swept)
+    swept, gap = removal.swept, gap_text(removal.swept)
     said = [f"{one.object.name} {until_text(one.until)}" for one in swept.touching[:MOST_NAMED]]
     apart = "" if gap == "-" else f", surfaces {gap} apart"
     return apart + (f"; touches {', '.join(said)}" if said else "")
 
 
-def _no_way(found: Extraction) -> str:
+def _no_path(found: Extraction) -> str:
     pulls = f"{found.pulls} straight pull{'s' * (found.pulls != 1)}"
     tried = f"{pulls} and {found.motions:,} motions" if found.is_planned else pulls
     if found.is_planned and not found.motions:
@@ -60,7 +60,7 @@ def disassembly_line(found: Disassembly) -> str:
     if not found.is_found:
         return _no_order(found)
     last = extraction_line(found.steps[-1].found)
-    before = _taken_off(found)[: -len(found.parts)]
+    before = _removed_text(found)[: -len(found.parts)]
     return f"after {names_of(before)}: {last}" if before else f"nothing goes before: {last}"
 
 
@@ -80,9 +80,9 @@ def _no_order(found: Disassembly) -> str:
         tried += ", the time is over"
     blockers = names_of([one.object for one in found.blockers])
     said = f"{tried}: blocked by {blockers}" if blockers else tried
-    taken = _taken_off(found)
+    taken = _removed_text(found)
     return said + (f"; taken off in vain: {names_of(taken)}" if taken else "")
 
 
-def _taken_off(found: Disassembly) -> list[Object]:
+def _removed_text(found: Disassembly) -> list[Object]:
     return [obj for step in found.steps for obj in step.found.parts]

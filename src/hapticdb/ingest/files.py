@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.cluster.workers import Cluster, connected
+from hapticdb.cluster.scheduler import Cluster, connected
 from hapticdb.errors import (
     EnvironmentExistsError,
     FileError,
@@ -24,8 +24,8 @@ from hapticdb.errors import (
 )
 from hapticdb.grid import Grid, GridOptions
 from hapticdb.ingest.planning import (
-    KnownParts,
     Plan,
+    StoredParts,
     added_or_present,
     check_inside,
     check_names,
@@ -37,7 +37,7 @@ from hapticdb.mesh.chord import check_chord
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
-from hapticdb.store.refusals import wants_distances
+from hapticdb.store.store_errors import wants_distances
 
 
 class ImportProgress(NamedTuple):
@@ -66,7 +66,7 @@ class FileReport:
     """Number of objects already in the environment."""
     restored: int = 0
     """Number of added parts that had been removed from the environment before."""
-    kept_removed: int = 0
+    still_removed: int = 0
     """Number of removed parts that were skipped: `ImportOptions.keep_removed`."""
     replaced: int = 0
     dropped: int = 0
@@ -326,7 +326,7 @@ def ingest_file(
     `GeometryChangedError` for a changed part without `ImportOptions.replace`.
     """
     check_names(mesh_file)
-    known = KnownParts(store, mesh_file.link)
+    known = StoredParts(store, mesh_file.link)
     plan = planned(
         mesh_file, options.unit, store.grid, known.by_name, store.removed(mesh_file.link),
         replace=options.replace, keep_removed=options.keep_removed,
@@ -347,7 +347,7 @@ def ingest_file(
         written,
         len(mesh_file.parts) - len(added) - n_kept - n_replaced,
         restored=sum(obj.name in plan.removed for obj in written),
-        kept_removed=n_kept,
+        still_removed=n_kept,
         replaced=n_replaced,
         dropped=n_dropped,
         defects=mesh_file.defects,
@@ -361,7 +361,7 @@ def _write_parts(
     store: Store,
     mesh_file: MeshFile,
     plan: Plan,
-    known: KnownParts,
+    known: StoredParts,
     unit_and_jobs: tuple[str | None, int | Cluster],
     progress: ImportCallback | None,
 ) -> tuple[list[int], int]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hapticdb.errors import FileError, UsageError
 from hapticdb.ingest.layout import Bricks, bricks_of_rows, merged
-from hapticdb.mesh import Part, packing
+from hapticdb.mesh import Part, surface_packing
 from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object, Rows, Store, joined
@@ -29,15 +29,15 @@ def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, 
     A surface is read once, and stays in memory up to its last object.
     """
     uses = Counter(obj.digest for obj in objects)
-    asked: set[str] = set()
+    requested: set[str] = set()
     packed: dict[str, bytes] = {}
     shapes: dict[str, Part] = {}
     for at, obj in enumerate(objects):
         digest = obj.digest
-        if digest not in asked:
-            ahead = {later.digest for later in objects[at : at + AT_ONCE]} - asked
+        if digest not in requested:
+            ahead = {later.digest for later in objects[at : at + AT_ONCE]} - requested
             packed |= store.surfaces(sorted(ahead))
-            asked |= ahead
+            requested |= ahead
         if digest not in shapes:
             shapes[digest] = unpacked_part(store.url, obj, packed.pop(digest, None))
         shape = shapes[digest]
@@ -52,7 +52,7 @@ def unpacked_part(url: str, obj: Object, surface: bytes | None) -> Part:
     if surface is None:
         raise damaged(url, f"object {obj.id} ({obj.name}) has no surface")
     try:
-        vertices, faces, colours, chord = packing.unpack(surface)
+        vertices, faces, colours, chord = surface_packing.unpack(surface)
     except ValueError as error:
         raise damaged(url, f"object {obj.id}: {error}") from None
     part = Part(obj.name, vertices, faces, obj.transform, colours=colours, chord=chord)
@@ -63,7 +63,7 @@ def unpacked_part(url: str, obj: Object, surface: bytes | None) -> Part:
 
 def packed_surface(part: Part) -> bytes:
     """Packed geometry of a part; FileError if too large for a database row."""
-    surface = packing.pack(part.vertices, part.faces, part.colours, part.chord)
+    surface = surface_packing.pack(part.vertices, part.faces, part.colours, part.chord)
     if len(surface) > MOST_BYTES:
         raise FileError(
             f"part {part.name!r}: its surface takes {len(surface) / 1e9:.1f} GB packed, and at "

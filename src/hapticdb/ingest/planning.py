@@ -58,13 +58,13 @@ def check_cost(parts: Iterable[Part], link: str, grid: Grid, most: float | None)
     work.
     """
     size, most = grid.voxel_size, most or VOXEL_LIMIT
-    met = sum(_area(part) for part in parts) / size**2
-    if met > most:
-        shown = float(f"{met:.2g}")
+    n_voxels = sum(_area(part) for part in parts) / size**2
+    if n_voxels > most:
+        shown = float(f"{n_voxels:.2g}")
         raise FileError(
             f"{link}: its surfaces meet about {shown:,.0f} voxels of {length_text(size)}, more "
             f"than {most:,.0f}, which takes long: give larger voxels, of "
-            f"{length_text(1.01 * size * (met / most) ** 0.5)}, fewer --bits, or a larger "
+            f"{length_text(1.01 * size * (n_voxels / most) ** 0.5)}, fewer --bits, or a larger "
             "--voxel-limit"
         )
 
@@ -104,7 +104,7 @@ def _box(bounds: NDArray[np.float64]) -> str:
     return f"({low}) to ({high})"
 
 
-class KnownParts:
+class StoredParts:
     """Stored parts of a file, updated from the environment's log of changes.
 
     by_name : their objects, by the names of the parts. Of two imports of one file of 1,500 parts at
@@ -142,7 +142,7 @@ class KnownParts:
 
 
 def added_or_present(
-    store: Store, part: Object, rows: Rows, surface: bytes, known: KnownParts
+    store: Store, part: Object, rows: Rows, surface: bytes, known: StoredParts
 ) -> list[int]:
     """Add a part: its id, or nothing if another process has added the same part meanwhile.
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.cluster.workers import Cluster
+from hapticdb.cluster.scheduler import Cluster
 from hapticdb.errors import FileError
 from hapticdb.grid import Grid
 from hapticdb.ingest.geometry import packed_surface
@@ -166,7 +166,7 @@ def check_room(n_bytes: int, what: str) -> None:
         )
 
 
-class Recipe(NamedTuple):
+class VoxelizerSettings(NamedTuple):
     """Settings that determine the rows of a part."""
 
     link: str
@@ -205,14 +205,16 @@ def voxelize_parts(
     """
     given = {"unit": unit, "up": file.up}
     attributes: dict[str, object] = {name: value for name, value in given.items() if value}
-    recipe = Recipe(file.link, attributes, store.grid, store.layout, store.wants_distances)
+    recipe = VoxelizerSettings(
+        file.link, attributes, store.grid, store.layout, store.wants_distances
+    )
     surfaces: dict[str, bytes] = {}
-    asked: set[str] = set()
+    packed: set[str] = set()
 
     def items() -> Iterator[tuple[Part, bool]]:
         for part in parts:
-            yield part, part.digest not in asked  # instances share a surface
-            asked.add(part.digest)
+            yield part, part.digest not in packed  # instances share a surface
+            packed.add(part.digest)
 
     made: Generator[tuple[Object, Rows, bytes | None] | float, None, None] = (
         in_threads(items(), recipe.object_of, jobs)

@@ -26,11 +26,11 @@ from hapticdb.kernels._machine_code import (
 )
 
 LONGEST = (
-    *("period.loop", "query.refining", "resident.feeling"),
-    *("triangles.nearest", "surfaces.distances", "triangles.sweeping"),
+    *("period.loop", "query.refining", "resident.cell_frames"),
+    *("triangles.surface_distance", "surfaces.distances", "triangles.path_distance"),
 )
 """Modules with the longest compilation, first in the queue: 13 s to 2 s of 50."""
-PATIENCE = 1200.0
+TIMEOUT = 1200.0
 """Time limit of compiling processes, seconds. Larger: slower machines finish."""
 MOST_SETS = 30
 """Most sets in a folder, 2 MB each; older ones are removed."""
@@ -81,9 +81,9 @@ def _compile_into(folder: Path, group: str) -> None:
     Their queue is a pipe of module numbers, a byte each.
     """
     modules, known = _modules(group), level()
-    asked, ask = os.pipe()
-    os.write(ask, bytes(range(len(modules))))
-    os.close(ask)
+    queue, feed = os.pipe()
+    os.write(feed, bytes(range(len(modules))))
+    os.close(feed)
     env = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
     env |= {
         BUILDING: str(folder),
@@ -93,12 +93,12 @@ def _compile_into(folder: Path, group: str) -> None:
     # same package as here, in any working folder
     env["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     workers: list[subprocess.Popen[bytes]] = []
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + TIMEOUT
     try:
         for _ in range(os.cpu_count() or 1):
             worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
                 [sys.executable, "-c", SERVE, str(os.getpid()), *modules],
-                stdin=asked,
+                stdin=queue,
                 stdout=subprocess.DEVNULL,
                 env=env,
                 start_new_session=True,  # the parent handles Ctrl-C and ends this process
@@ -107,12 +107,12 @@ def _compile_into(folder: Path, group: str) -> None:
         if any(worker.wait(until - time.monotonic()) for worker in workers):
             raise OSError("a process that compiles has failed: its errors are above")
     except subprocess.TimeoutExpired as error:
-        raise OSError(f"compiling was not done after {PATIENCE:g} s") from error
+        raise OSError(f"compiling was not done after {TIMEOUT:g} s") from error
     finally:
         for worker in workers:
             worker.kill()
             worker.wait()
-        os.close(asked)
+        os.close(queue)
 
 
 def serve() -> None:

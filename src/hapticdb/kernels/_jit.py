@@ -49,7 +49,7 @@ class Declared(NamedTuple):
 
 
 ENTRIES: dict[str, Declared] = {}
-"""Entries of the loaded modules, by module and name: ``query.grouping.gap_rows``.
+"""Entries of the loaded modules, by module and name: ``query.key_ranges.gap_rows``.
 
 The variant of an entry for the distance law has the suffix `BY_DISTANCE`.
 """

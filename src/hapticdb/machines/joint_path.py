@@ -114,10 +114,10 @@ def beyond_limits(machine: Machine, values: Floats) -> Iterable[str]:
 def joint_path(machine: Machine, values: Floats, pairs: Iterable[tuple[int, int]]) -> SampledPath:
     """Path over rows, its parameter the greatest motion of any link in the frame of another."""
     speeds = [motion_bounds(machine, values, *pair).speed for pair in pairs]
-    ways = np.concatenate([[0.0], np.cumsum(np.max(speeds, axis=0))])
-    if not np.isfinite(ways[-1]):
+    parameters = np.concatenate([[0.0], np.cumsum(np.max(speeds, axis=0))])
+    if not np.isfinite(parameters[-1]):
         raise UsageError("the joint path is longer than numbers go: check its units")
-    return SampledPath(ways, values)
+    return SampledPath(parameters, values)
 
 
 def mover_of(
@@ -143,6 +143,6 @@ def mover_of(
     before = base if frame is None else np.linalg.inv(machine.placed(own, first))
     poses = before @ machine.placed(own, last)
     poses[:, 3] = 0.0, 0.0, 0.0, 1.0
-    way = ToolPath.of(poses, surface.corners, surface.corners.mean(axis=0))
-    ways = np.interp(knots, np.arange(len(values)), path.ways)
-    return Mover(surface, way, machine.names[last], ways, frame)
+    motion = ToolPath.of(poses, surface.corners, surface.corners.mean(axis=0))
+    parameters = np.interp(knots, np.arange(len(values)), path.parameters)
+    return Mover(surface, motion, machine.names[last], parameters, frame)

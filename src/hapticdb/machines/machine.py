@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import FileError
 from hapticdb.grid import corners_of
-from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.pointshell.shape import CollisionShape
+from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ class Joint(NamedTuple):
     offset: float = 0.0
 
 
-class LinkSurface(MovingSurface):
+class LinkSurface(ToolSurface):
     """Surface of a link, its own frame; chord error in metres."""
 
     def __init__(self, triangles: Floats, chord: float) -> None:
@@ -64,7 +64,7 @@ class Machine:
         Surfaces of links, by their numbers.
     joints : tuple of Joint
         Parents first.
-    left_out : frozenset of pairs of names, or None
+    excluded : frozenset of pairs of names, or None
         Pairs of links excluded by the file; None if it has no such list.
     notes : tuple of str
     """
@@ -73,7 +73,7 @@ class Machine:
     names: tuple[str, ...]
     surfaces: Mapping[int, LinkSurface]
     joints: tuple[Joint, ...]
-    left_out: frozenset[frozenset[str]] | None = None
+    excluded: frozenset[frozenset[str]] | None = None
     notes: tuple[str, ...] = ()
 
     @cached_property

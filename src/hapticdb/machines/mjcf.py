@@ -44,11 +44,11 @@ class _Reading:
             if carriers[body] == body:
                 self._add(body)
         pieces: dict[int, list[tuple[Floats, float]]] = {}
-        is_felt = (model.geom_contype | model.geom_conaffinity) != 0
-        felt = {carriers[body] for body in model.geom_bodyid[is_felt].tolist()}
+        is_colliding = (model.geom_contype | model.geom_conaffinity) != 0
+        colliding = {carriers[body] for body in model.geom_bodyid[is_colliding].tolist()}
         for geom, body in enumerate(model.geom_bodyid.tolist()):
             carrier = carriers[body]
-            if is_felt[geom] or carrier not in felt:
+            if is_colliding[geom] or carrier not in colliding:
                 pieces.setdefault(self._link[carrier], []).extend(self._surface(geom, body))
         surfaces = {
             link: LinkSurface(np.concatenate([one for one, _ in found]), max(c for _, c in found))
@@ -56,7 +56,7 @@ class _Reading:
             if found
         }
         return Machine(
-            str(self._path), tuple(self._names), surfaces, self._following(), self._left_out(),
+            str(self._path), tuple(self._names), surfaces, self._following(), self._excluded(),
             tuple(self._notes),
         )  # fmt: skip
 
@@ -140,7 +140,7 @@ class _Reading:
             found[first] = one._replace(driver=other.name, factor=data[1], offset=offset)
         return tuple(found)
 
-    def _left_out(self) -> frozenset[frozenset[str]]:
+    def _excluded(self) -> frozenset[frozenset[str]]:
         """Pairs of <exclude>, and links with the one that carries them, but for the world."""
         model, names = self._model, self._names
         carriers = model.body_weldid.tolist()

@@ -35,7 +35,7 @@ def read_machine(path: str | PathLike[str], srdf: str | PathLike[str] | None = N
         raise FileError(f"{path}: its root is <{root.tag[:40]}>: give a URDF or MJCF file")
     if not machine.surfaces:
         raise FileError(f"{path}: none of its links has a surface")
-    return machine if srdf is None else replace(machine, left_out=_pairs_of(Path(srdf), machine))
+    return machine if srdf is None else replace(machine, excluded=_pairs_of(Path(srdf), machine))
 
 
 def xml_root(path: Path) -> ET.Element:

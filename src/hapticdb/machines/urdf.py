@@ -41,8 +41,8 @@ def machine_of_urdf(path: Path, root: ET.Element) -> Machine:
                     notes.append(name)
                 break
     joints = tuple(_joint(path, above[name], order) for name in order[1:])
-    told = [f"links without collision geometry have their visual one: {', '.join(notes)}"]
-    return Machine(str(path), tuple(order), surfaces, joints, None, tuple(told if notes else ()))
+    remark = [f"links without collision geometry have their visual one: {', '.join(notes)}"]
+    return Machine(str(path), tuple(order), surfaces, joints, None, tuple(remark if notes else ()))
 
 
 def _named(path: Path, root: ET.Element, tag: str) -> dict[str, ET.Element]:
@@ -75,8 +75,8 @@ def _tree(
         below.setdefault(ends[0], []).append(ends[1])
     order = [name for name in links if name not in above]
     if len(order) != 1:
-        told = ", ".join(order[:3]) or "none, its joints form a circle"
-        raise FileError(f"{path}: one link must stand on no joint, the base; there is {told}")
+        remark = ", ".join(order[:3]) or "none, its joints form a circle"
+        raise FileError(f"{path}: one link must stand on no joint, the base; there is {remark}")
     for name in order:
         order.extend(below.get(name, ()))
     if len(order) < len(links):

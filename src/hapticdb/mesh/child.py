@@ -65,7 +65,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
 
     from hapticdb.mesh.formats.gltf import bytes_beside  # noqa: PLC0415
     from hapticdb.mesh.parse import cause_of, parse, reader_of  # noqa: PLC0415
-    from hapticdb.mesh.raw import NAMED, UnreadableError  # noqa: PLC0415
+    from hapticdb.mesh.parsed import NAMED, UnreadableError  # noqa: PLC0415
 
     before = None
     try:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.mesh.raw import Shape, told
+from hapticdb.mesh.parsed import Shape, count_note
 from hapticdb.units import length_text
 
 Floats = NDArray[np.float64]
@@ -69,12 +69,12 @@ def measured(shape: Shape, wanted: float) -> Shape:
     return replace(shape, chord=error, normals=None)
 
 
-def told_coarser(shapes: Sequence[Shape], wanted: float) -> list[str]:
+def coarser_note(shapes: Sequence[Shape], wanted: float) -> list[str]:
     """Note of shapes with a chord error above the requested one, metres."""
     over = [one.chord for one in shapes if one.chord > _OVER * wanted]
     worst = length_text(max(over, default=0.0))
     words = "shape{s} {are} tessellated with a chord error of up to {worst}, not {wanted} as wanted"
-    return told(len(over), words, worst=worst, wanted=length_text(wanted))
+    return count_note(len(over), words, worst=worst, wanted=length_text(wanted))
 
 
 def chord_error(

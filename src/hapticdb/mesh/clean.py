@@ -7,8 +7,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.mesh.parsed import Parsed, Placement, Shape, UnreadableError, count_note
 from hapticdb.mesh.part import Defects, MeshFile, Part
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, told
 from hapticdb.units import length_text
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -86,7 +86,7 @@ def _coarse(parsed: Parsed, scale: float) -> list[str]:
                 f"'{placement.name}' lies {length_text(farthest * scale)} from the origin, where "
                 f"its 32-bit numbers are {length_text(step * scale)} apart: details are lost"
             )
-    return found[:1] + told(len(found) - 1, "more part{s}, likewise")
+    return found[:1] + count_note(len(found) - 1, "more part{s}, likewise")
 
 
 def _checked(

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from hapticdb.mesh.clean import clean
+from hapticdb.mesh.parsed import Parsed, UnreadableError
 from hapticdb.mesh.part import MeshFile
-from hapticdb.mesh.raw import Parsed, UnreadableError
 
 READERS = {
     ".3mf": "threemf",

@@ -22,8 +22,8 @@ from hapticdb.errors import FileError, MissingExtraError, pip_line
 from hapticdb.mesh.chord import check_chord
 from hapticdb.mesh.clean import read_only
 from hapticdb.mesh.parse import READERS, is_tessellated, parse
+from hapticdb.mesh.parsed import UnreadableError
 from hapticdb.mesh.part import Defects, MeshFile, Part
-from hapticdb.mesh.raw import UnreadableError
 from hapticdb.mesh.scratch import scratch_folder
 from hapticdb.units import metres_of
 
@@ -107,7 +107,7 @@ def read_file(
         "sys_path": sys.path,
     }
     try:
-        return _ask_child(request, seconds)
+        return _run_child(request, seconds)
     except UnreadableError as error:
         is_slow = is_tessellated(file) and _MORE_TIME in str(error)
         cause = f"{error}, or a larger --chord" if is_slow else error
@@ -177,7 +177,7 @@ def _one_line(path: str | os.PathLike[str], cause: object) -> str:
     return "".join(c if c.isprintable() else " " for c in text)
 
 
-def _ask_child(request: dict[str, Any], seconds: float) -> MeshFile:
+def _run_child(request: dict[str, Any], seconds: float) -> MeshFile:
     """Run a request in a child process; no child outlives this call."""
     # One arena and one thread: memory reserved per thread would count as the file's.
     settings = {

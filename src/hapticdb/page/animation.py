@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import FileError, MissingExtraError, pip_line
-from hapticdb.exact.report import names_of
-from hapticdb.extraction.result import Extraction
+from hapticdb.exact.sweep_report import names_of
+from hapticdb.extraction.extraction_results import Extraction
 from hapticdb.grid import corners_of
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.page import colours
@@ -77,7 +77,7 @@ def animate(
     removes them; up : vertical axis 'x', 'y' or 'z', by default that of most of the objects' files.
     """
     check_view()
-    from hapticdb.page.process import new_server, stop  # noqa: PLC0415 - the extra `view`
+    from hapticdb.page.page_process import new_server, stop  # noqa: PLC0415 - the extra `view`
 
     server = new_server()
     try:
@@ -155,8 +155,8 @@ def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
 
 def _shown_poses(found: Extraction) -> Floats:
     """Displacements (n, 4, 4), evenly spaced in the path parameter, both ends included."""
-    assert found.way is not None  # noqa: S101 - each step has a path
-    path = found.way.swept.path
+    assert found.path is not None  # noqa: S101 - each step has a path
+    path = found.path.swept.path
     return path.at(np.linspace(0.0, path.length, PLACES))
 
 

@@ -14,9 +14,9 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page import checks, colours
 from hapticdb.page.connection import Visitor
 from hapticdb.page.drawing import HandDrawing, add_tool, put_at
-from hapticdb.page.scene.browser import BrowserScene
+from hapticdb.page.scene.browser_scene import BrowserScene
 from hapticdb.page.site import Site
-from hapticdb.page.tools import HeldTool
+from hapticdb.page.tools import PageTool
 from hapticdb.page.wording import plain_name
 from hapticdb.poses import pose_of_row, row_of_pose
 from hapticdb.session.coupling import Coupling
@@ -62,23 +62,23 @@ class Browser:
         up = site.view.up
         self.scene = BrowserScene(client, site.view.contents, up, float(site.facts.bounds[0, up]))
         self.chosen: tuple[int, ...] = ()
-        self.taken: int | None = None
-        self.tool: HeldTool = site.tools[0]
+        self.dragged_part: int | None = None
+        self.tool: PageTool = site.tools[0]
         self.stiffness = 1000.0
         self.scale = site.facts.diagonal / HAND_WIDTH
         self.session: HostedSession | None = None
-        self._unfelt: list[int] = []
+        self._excluded_ids: list[int] = []
         self.hand = self._start()
         self.has_moved = False
         """Whether the person has moved the hand."""
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY)
         self.works: list[Any] = []
-        """Long jobs of the panels, `panels.working.Work`."""
+        """Long jobs of the panels, `panels.jobs.Work`."""
         self._begun: float | None = None
         self._keeps_tool: bool | None = None  # of the requested session; None: no request
         self._over: list[HostedSession] = []  # detached, to end
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
-        self._holding = threading.Lock()
+        self._zeroing = threading.Lock()
         self._is_closed = False
         self._shared: list[Any] = []
         self._shown = np.full(7, np.inf)
@@ -109,7 +109,7 @@ class Browser:
             if self._is_closed:
                 return
             if not self.visitor.may(role):
-                self.tell(
+                self.notify(
                     "Not allowed", f"this takes the role {role}; yours is {self.visitor.role}"
                 )
                 return
@@ -131,7 +131,7 @@ class Browser:
         """Whether the connection is lost; viser's disconnect event may come later."""
         return self.client.client_id not in self.site.server.get_clients()
 
-    def tell(self, title: str, text: str, *, is_good: bool = False) -> None:
+    def notify(self, title: str, text: str, *, is_good: bool = False) -> None:
         """Show a notification in this browser alone."""
         if not self._is_closed:
             self.client.add_notification(
@@ -140,7 +140,7 @@ class Browser:
 
     def failed(self, error: Exception) -> None:
         """Show an error without the server's paths and addresses."""
-        self.tell("Not done", self.site.error_text(error))
+        self.notify("Not done", self.site.error_text(error))
 
     async def _moved(self, event: "TransformControlsEvent") -> None:
         """Move the hand; async, on viser's event loop, so that events stay in order."""
@@ -160,28 +160,28 @@ class Browser:
         if session is not None and not session.is_over:
             session.move(pose)
 
-    def take_in_hand(self, tool: HeldTool, pose: Floats | None = None) -> None:
+    def use_tool(self, tool: PageTool, pose: Floats | None = None) -> None:
         """Use another tool, from a pose (7,), by default the start pose."""
-        with self._holding:  # a second click calls this in another thread
+        with self._zeroing:  # a second click calls this in another thread
             self.tool = tool
             self.hand = self._start() if pose is None else pose
-            self.drawing.hold(tool, self.colour, self.hand)
+            self.drawing.show_ghost(tool, self.colour, self.hand)
             self.begin_anew(keeps_tool=False)
             self.tool_changed()
             self.hand_moved()
 
     def put_back(self) -> None:
         """Put the dragged part back and use the first tool; without a dragged part, do nothing."""
-        taken, self.taken = self.taken, None
-        if taken is not None:
-            self.scene.show((taken,))
-            self.take_in_hand(self.site.tools[0])
+        dragged, self.dragged_part = self.dragged_part, None
+        if dragged is not None:
+            self.scene.show((dragged,))
+            self.use_tool(self.site.tools[0])
 
     @property
-    def unfelt(self) -> list[int]:
+    def excluded_ids(self) -> list[int]:
         """Ids of the objects without collision here: hidden objects and the dragged part."""
-        taken = () if self.taken is None else (self.taken,)
-        return sorted({*self.scene.hidden, *taken} & self.site.objects.keys())
+        dragged = () if self.dragged_part is None else (self.dragged_part,)
+        return sorted({*self.scene.hidden, *dragged} & self.site.objects.keys())
 
     def chosen_objects(self) -> list[Object]:
         """Chosen objects that still exist."""
@@ -197,7 +197,7 @@ class Browser:
 
     def filter_changed(self) -> None:
         """Restart the session if the set of colliding objects has changed."""
-        if self.unfelt != self._unfelt:
+        if self.excluded_ids != self._excluded_ids:
             self.begin_anew()
 
     def begin_anew(self, *, keeps_tool: bool = True) -> None:
@@ -217,7 +217,7 @@ class Browser:
                 self.failed(error)
             except Exception:
                 LOG.exception("a session could not begin")
-                self.tell("No tool", "the session could not begin; the operator's log says why")
+                self.notify("No tool", "the session could not begin; the operator's log says why")
             finally:
                 self._beginning.release()
 
@@ -230,12 +230,12 @@ class Browser:
         tool = self._leave_session()
         self._end_sessions()
         start = tool if keeps_tool and tool is not None else self.hand
-        self._unfelt = self.unfelt
+        self._excluded_ids = self.excluded_ids
         with ExitStack() as undo:
             undo.callback(self.drawing.rest)
             undo.callback(self._unshare)
             session = self.site.host.begin(
-                self.tool.shell, pose_of_row(start[:3], start[3:]), exclude=self._unfelt,
+                self.tool.shell, pose_of_row(start[:3], start[3:]), exclude=self._excluded_ids,
                 coupling=self._coupling(), scale=self.scale,
             )  # fmt: skip
             undo.callback(session.end)
@@ -277,12 +277,12 @@ class Browser:
                 session.end()
             except Exception:  # every other part of it has ended
                 LOG.exception("a session did not end well")
-            self._tell_lost_frames(session)
+            self._report_lost_frames(session)
 
-    def _tell_lost_frames(self, session: HostedSession) -> None:
+    def _report_lost_frames(self, session: HostedSession) -> None:
         n_lost, session.lost_frames = session.lost_frames, 0
         if n_lost:
-            self.tell(
+            self.notify(
                 "Recording incomplete", f"{n_lost:,} frames were lost: the server was too busy"
             )
 
@@ -337,11 +337,11 @@ class Browser:
             if self._give_up(session):
                 self.drawing.rest()
                 self.session_ended()
-                self.tell("Tool lost", "its process ended; it begins again")
+                self.notify("Tool lost", "its process ended; it begins again")
                 self.begin_anew()
             return
         if session is not None and session.lost_frames:
-            self._tell_lost_frames(session)
+            self._report_lost_frames(session)
         frame = None if session is None else session.latest()
         if session is None or frame is None:
             return
@@ -368,17 +368,17 @@ class Browser:
         if now - self._plumbed_at < PLUMB_EVERY:
             return
         self._plumbed_at = now
-        met = self.scene.pick(self.hand[:3], -self.site.facts.up)
-        self.drawing.plumb(self.hand[:3], None if met is None else met.point)
+        hit = self.scene.pick(self.hand[:3], -self.site.facts.up)
+        self.drawing.plumb(self.hand[:3], None if hit is None else hit.point)
 
     def objects_changed(self) -> None:
         """Drop removed objects from the selection; called in the follower's thread."""
         present = self.site.objects.keys()
         self.chosen = tuple(i for i in self.chosen if i in present)
-        if self.taken is not None and self.taken not in present:
-            self.taken = None
+        if self.dragged_part is not None and self.dragged_part not in present:
+            self.dragged_part = None
         self.scene.shade()
-        if not set(self.unfelt) <= set(self._unfelt):  # a hidden object has come back
+        if not set(self.excluded_ids) <= set(self._excluded_ids):  # a hidden object has come back
             self.begin_anew()
 
     def close(self) -> None:

@@ -94,7 +94,7 @@ class PageConnection:
             try:
                 self.visitor(client)
             except KeyError:
-                self.tell("refused")
+                self.send("refused")
                 await live[client].close(LATE, "connect through the server")
             nonsense.contain(connection)
 
@@ -115,7 +115,7 @@ class PageConnection:
         ids = tuple(int(i) for i in request.headers.get(SHOWN, "").split(",") if i)
         return Visitor(request.headers[NAME], request.headers[ROLE], ids)
 
-    def tell(self, word: str) -> None:
+    def send(self, word: str) -> None:
         """Send a message to the server; ignored if the server has ended."""
         with contextlib.suppress(OSError):
             self._socket.sendall(line(word))
@@ -126,7 +126,7 @@ class PageConnection:
                 message = json.loads(received)
                 match message["word"]:
                     case "ping":
-                        self.tell("pong")
+                        self.send("pong")
 
 
 class _Nonsense:

@@ -30,7 +30,7 @@ class DatabaseThread:
         self._thread = threading.Thread(target=self._run, name="database", daemon=True)
         self._thread.start()
 
-    def ask(
+    def submit(
         self,
         job: Callable[[Environment], Answer],
         then: Callable[[Answer], Any],

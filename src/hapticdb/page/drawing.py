@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.page import colours
-from hapticdb.page.tools import HeldTool
+from hapticdb.page.tools import PageTool
 
 if TYPE_CHECKING:
     from viser import (
@@ -35,7 +35,7 @@ CONTACT_SHARE = 0.004
 
 
 def add_tool(
-    scene: "SceneApi", name: str, tool: HeldTool, colour: colours.Colour, opacity: float | None
+    scene: "SceneApi", name: str, tool: PageTool, colour: colours.Colour, opacity: float | None
 ) -> "MeshHandle":
     """Add a tool's surface to a scene; the pose of its handle is the tool's."""
     return scene.add_mesh_simple(
@@ -124,7 +124,7 @@ class HandDrawing:
             point_shape="circle", precision="float32", visible=False, position=self.middle,
         )  # fmt: skip
 
-    def hold(self, tool: HeldTool, colour: colours.Colour, pose: Floats) -> None:
+    def show_ghost(self, tool: PageTool, colour: colours.Colour, pose: Floats) -> None:
         """Show a tool's ghost at the gizmo, both at a pose (7,)."""
         if self._ghost is not None:
             self._ghost.remove()
@@ -155,12 +155,12 @@ class HandDrawing:
     def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
         """Show a force (3,), N, at a position by an arrow with its node at `middle`."""
         longest = LONGEST_ARROW * self._diagonal
-        way = force * (longest / self.cap)
-        length = float(np.linalg.norm(way))
+        arrow_vector = force * (longest / self.cap)
+        length = float(np.linalg.norm(arrow_vector))
         is_seen = length > ARROW_BEGINS * longest
         if is_seen:
-            way = way * (min(length, longest) / length)
-            arrow.points = self._sent([[start, start + way]])
+            arrow_vector = arrow_vector * (min(length, longest) / length)
+            arrow.points = self._sent([[start, start + arrow_vector]])
         arrow.visible = is_seen
 
     def show_contacts(self, points: Floats, palette: NDArray[np.uint8]) -> None:

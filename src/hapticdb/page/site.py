@@ -16,7 +16,7 @@ from hapticdb.errors import UsageError
 from hapticdb.page import tools
 from hapticdb.page.connection import PageConnection, PageRequest
 from hapticdb.page.database import DatabaseThread
-from hapticdb.page.editing import Edits
+from hapticdb.page.edits import Edits
 from hapticdb.page.scene.surroundings import set_first_view
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text

@@ -47,7 +47,7 @@ class TabbedBrowser(Browser):
         if len(self.chosen) == 2:
             self.parts.measure()
         if visitor.may("toucher"):
-            self.take_in_hand(self.tool)
+            self.use_tool(self.tool)
 
     def hand_moved(self) -> None:
         """Show the hand's position."""
@@ -100,6 +100,6 @@ class TabbedBrowser(Browser):
 
     def _clicked(self, event: Any) -> None:  # noqa: ANN401 - an event of viser
         origin = checks.numbers_of(event.ray_origin, 3, checks.FARTHEST, "a ray")
-        way = checks.numbers_of(event.ray_direction, 3, checks.FARTHEST, "a ray")
+        direction = checks.numbers_of(event.ray_direction, 3, checks.FARTHEST, "a ray")
         adds = event.modifier is not None
-        self.parts.clicked(self.view.seen_from(origin, way), way, adds=adds)
+        self.parts.clicked(self.view.seen_from(origin, direction), direction, adds=adds)

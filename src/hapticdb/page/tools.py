@@ -33,7 +33,7 @@ AROUND = 40
 
 
 @dataclass(frozen=True, eq=False)
-class HeldTool:
+class PageTool:
     """A tool of the page.
 
     sample : samples the point shell, by kernels; vertices (V, 3) : of its surface, metres, about
@@ -57,7 +57,7 @@ class HeldTool:
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
 
-def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list[HeldTool]:
+def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list[PageTool]:
     """Probes in proportion to a scene: a ball and a peg.
 
     diagonal : of the scene's AABB, metres; has_distances : whether forces come from distances, so
@@ -77,11 +77,11 @@ def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list
     for name, profile in zip(("ball", "peg"), profiles, strict=True):
         vertices, faces = _turned(profile)
         sample = partial(PointShell.from_mesh, vertices, faces, POINTS, inset=inset)
-        found.append(HeldTool(name, sample, vertices, faces, is_round=name == "ball"))
+        found.append(PageTool(name, sample, vertices, faces, is_round=name == "ball"))
     return found
 
 
-def from_files(paths: Sequence[str], voxel_size: float, *, has_distances: bool) -> list[HeldTool]:
+def from_files(paths: Sequence[str], voxel_size: float, *, has_distances: bool) -> list[PageTool]:
     """Tools of the operator's files, by the files' names; FileError without a surface."""
     inset = inset_of(voxel_size, "distance" if has_distances else "plane")
     found = []
@@ -97,7 +97,7 @@ def from_files(paths: Sequence[str], voxel_size: float, *, has_distances: bool) 
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         faces = np.arange(len(vertices)).reshape(-1, 3)
         sample = partial(_centred_shell, vertices, faces, inset, file.link)
-        found.append(HeldTool(path.stem, sample, vertices - middle, faces))
+        found.append(PageTool(path.stem, sample, vertices - middle, faces))
     return found
 
 
@@ -108,7 +108,7 @@ def _centred_shell(
     return from_shell("", replace(shell, link=link)).shell
 
 
-def from_shell(name: str, shell: PointShell) -> HeldTool:
+def from_shell(name: str, shell: PointShell) -> PageTool:
     """Tool of a shell in any frame, moved so that the centre of its AABB is the origin."""
     middle = middle_of(shell)
     surface = shell.surface
@@ -124,7 +124,7 @@ def from_shell(name: str, shell: PointShell) -> HeldTool:
     centred = replace(
         shell, points=shell.points - middle, center=shell.center - middle, surface=surface
     )
-    return HeldTool(name, lambda: centred, vertices, faces)
+    return PageTool(name, lambda: centred, vertices, faces)
 
 
 def middle_of(shell: PointShell) -> Floats:

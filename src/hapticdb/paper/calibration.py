@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.query import contact, grouping
+from hapticdb.kernels.query import key_ranges, shell_keys
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.grouping import cbgroup
 from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.frame import locate
+from hapticdb.query.haptic_query import locate
 from hapticdb.store.base import Keys, Store, SupportsCaches, row_shift
 
 Floats = NDArray[np.float64]
@@ -98,7 +98,7 @@ class _Trials:
         """Time the scans of one shell's keys."""
         store = self._store
         for gap in (0, 1 << 9, 1 << 13, 1 << 16):
-            lows, highs = grouping.group_by_gap(probe.keys, probe.first, probe.last, gap)
+            lows, highs = key_ranges.group_by_gap(probe.keys, probe.first, probe.last, gap)
             rows = store.count(lows, highs)
             if rows > TOO_MANY_ROWS:
                 continue
@@ -228,9 +228,9 @@ def _probes(store: Store, quantiles: QuantileVector) -> list[_Probe]:
         # A tool lies on a surface or just below it; farther inside, gaps would hold more rows.
         away = rng.normal(size=3)
         pose[:3, 3] = surface + away / np.linalg.norm(away) * radius * rng.uniform(0.5, 1.0)
-        _, asked, keys = locate(PointShell.sphere(radius, n_points), pose, record)
+        _, addresses, keys = locate(PointShell.sphere(radius, n_points), pose, record)
         if not len(keys):
             continue
-        first, last = contact.spans_of_keys(asked, keys, record)
+        first, last = shell_keys.spans_of_keys(addresses, keys, record)
         probes.append(_Probe(keys, first, last))
     return probes

@@ -1,6 +1,6 @@
 """Grouping a frame's sorted keys into ranges: MaxGap and CBGroup (the paper, section 5)."""
 
-from hapticdb.kernels.query import grouping as kernels
+from hapticdb.kernels.query import key_ranges as kernels
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.store.base import Keys

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.query import grouping
+from hapticdb.kernels.query import key_ranges
 from hapticdb.store.base import Keys, Store, row_shift
 from hapticdb.store.parsing import damaged
 
@@ -39,7 +39,7 @@ class QuantileVector:
 
     def rows_between(self, left: int, right: int) -> float:
         """Expected rows with a key in [left, right]. Rows of neighbouring ranges add up."""
-        return float(grouping.gap_rows(left, right, self.bounds, self.rows_per_bucket))
+        return float(key_ranges.gap_rows(left, right, self.bounds, self.rows_per_bucket))
 
     @classmethod
     def of(cls, store: Store, resolution: int = DEFAULT_RESOLUTION) -> "QuantileVector":

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.law import reads_distances
-from hapticdb.kernels.query import contact, refining
+from hapticdb.kernels.force_law import reads_distances
+from hapticdb.kernels.query import refining, shell_keys
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
 from hapticdb.paper.quantiles import QuantileVector
-from hapticdb.query.frame import NOTHING_EXCLUDED, Asked, HapticQuery
+from hapticdb.query.haptic_query import NOTHING_EXCLUDED, HapticQuery, QueryCounts
 from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.query.touches import Query, Touch
 from hapticdb.store.base import Keys, LocatedShell, Rows, Store
@@ -48,7 +48,7 @@ class Strategies:
         pose: ArrayLike,
         strategy: Strategy = "auto",
         gap: int = DEFAULT_MAXGAP,
-        felt: Filter = ALL,
+        selection: Filter = ALL,
         law: ForceLaw | None = None,
     ) -> Touch:
         """Touch of a shell at one pose; see `hapticdb.environment.Environment.touch`."""
@@ -59,7 +59,7 @@ class Strategies:
             if strategy not in STRATEGIES:
                 raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
             form = self._forms.setdefault((strategy, gap), _Form(self, strategy, gap))
-        return self.query.touch(shell, pose, felt, law, form)
+        return self.query.touch(shell, pose, selection, law, form)
 
     def grouped(self, keys: Keys, distances: bool) -> Ranges:  # noqa: FBT001 - as `Group`
         """Ranges of row keys (U,) at the least cost; distances : whether these are read, too."""
@@ -75,17 +75,19 @@ class _Form:
     strategy: Strategy
     gap: int
 
-    def touch(self, located: contact.Located, exclude: Keys, law: ForceLaw, started: int) -> Touch:
+    def touch(
+        self, located: shell_keys.Located, exclude: Keys, law: ForceLaw, started: int
+    ) -> Touch:
         """Touch of a located shell; started : begin of the frame, ns."""
         if self.strategy == "statement":
             return self._by_statement(located, exclude, law, started)
         query, reads = self.frames.query, reads_distances(law.for_kernels)
         rows, statements, n_ranges = self._fetched(located, distances=reads)
-        asked: Asked = (self.strategy, statements, n_ranges, len(rows.keys))
+        counts: QueryCounts = (self.strategy, statements, n_ranges, len(rows.keys))
         payload = query.distances_of(rows, located.keys) if reads else None
-        return query.refined(located, rows, payload, exclude, law, asked, started)
+        return query.refined(located, rows, payload, exclude, law, counts, started)
 
-    def _fetched(self, located: contact.Located, *, distances: bool) -> tuple[Rows, int, int]:
+    def _fetched(self, located: shell_keys.Located, *, distances: bool) -> tuple[Rows, int, int]:
         """Rows of a frame, and the numbers of statements and of ranges."""
         store, keys = self.frames.store, located.keys
         if self.strategy == "points":
@@ -94,14 +96,14 @@ class _Form:
         if self.strategy == "array":
             return store.lookup(keys, distances=distances), 1, len(keys)
         if self.strategy == "maxgap":
-            first, last = contact.spans_of_keys(located.asked, keys, self.frames.query.grid)
+            first, last = shell_keys.spans_of_keys(located.addresses, keys, self.frames.query.grid)
             ranges = maxgap(keys, first, last, self.gap)
         else:
             ranges = self.frames.grouped(keys, distances)
         return store.scan(*ranges, distances=distances), 1, len(ranges.lows)
 
     def _by_statement(
-        self, located: contact.Located, exclude: Keys, law: ForceLaw, started: int
+        self, located: shell_keys.Located, exclude: Keys, law: ForceLaw, started: int
     ) -> Touch:
         """Run Figure 3, and a second statement for the ids dropped by its EXISTS, in a snapshot."""
         store, query = self.frames.store, self.frames.query
@@ -121,7 +123,7 @@ class _Form:
             placed, hits, addresses[hits], query.grid, law.for_kernels, depths
         )
         elapsed_us = (time.perf_counter_ns() - started) / 1000
-        asked = Query("statement", 2, len(addresses), len(ids), elapsed_us)
+        figures = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         pairs = np.stack([ordinals, ids], axis=1)[np.lexsort((ids, ordinals))]
 
         def pairs_of(_: ForceLaw, points: Keys) -> Keys:
@@ -129,6 +131,6 @@ class _Form:
 
         apart = NOTHING_EXCLUDED, depths[:0]
         return Touch(
-            wrench[:3], wrench[3:], hits, depths, np.unique(ids).tolist(), law, asked, apart,
+            wrench[:3], wrench[3:], hits, depths, np.unique(ids).tolist(), law, figures, apart,
             placed, pairs_of, query.known.by_id,
         )  # fmt: skip

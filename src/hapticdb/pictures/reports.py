@@ -13,12 +13,12 @@ from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 
+from hapticdb.clashes.clash_results import DEFAULT_KINDS, Clash, Clashes
 from hapticdb.clashes.groups import Group
-from hapticdb.clashes.result import ASKED, Clash, Clashes
 from hapticdb.clashes.rules import rule_text
 from hapticdb.environment import Environment
 from hapticdb.pictures.canvas import TOWARDS, turned
-from hapticdb.pictures.clashes import clashes_page, sight, snapshot
+from hapticdb.pictures.clash_page import clashes_page, snapshot, view_of
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 from hapticdb.units import place_text
@@ -48,36 +48,36 @@ def write_reports(
     files: Mapping[str, Path],
     env: Environment,
     found: Clashes,
-    told: Sequence[Clash],
+    shown: Sequence[Clash],
     groups: Sequence[Group],
     kinds: Sequence[Kind],
 ) -> None:
     """Write the reports `html`, `junit` and `bcf`, if their files are given.
 
-    `told`, `groups` : pairs of the page and their groups; `kinds` : requested ones, the default if
+    `shown`, `groups` : pairs of the page and their groups; `kinds` : requested ones, the default if
     empty.
     """
-    asked = kinds or ASKED
+    failing = kinds or DEFAULT_KINDS
     if "html" in files:
-        page = clashes_page(env, found, told, groups)
+        page = clashes_page(env, found, shown, groups)
         files["html"].write_text(page, encoding="utf-8")
     if "junit" in files:
-        files["junit"].write_bytes(junit(found, groups, asked))
+        files["junit"].write_bytes(junit(found, groups, failing))
     if "bcf" in files:
-        write_bcf(files["bcf"], env, [group for group in groups if group.kind in asked])
+        write_bcf(files["bcf"], env, [group for group in groups if group.kind in failing])
 
 
-def junit(found: Clashes, groups: Iterable[Group], asked: Sequence[Kind]) -> bytes:
+def junit(found: Clashes, groups: Iterable[Group], failing: Sequence[Kind]) -> bytes:
     """JUnit's XML: a test case for each group of the requested kinds, and for each rule.
 
     A group fails while a pair of it is open, and so does the first rule about an open pair. A rule
     without pairs is skipped; unmeasured pairs are an error.
     """
-    findings = [_finding(group) for group in groups if group.kind in asked]
+    findings = [_finding(group) for group in groups if group.kind in failing]
     if found.left:
         message = f"{found.left:,} pairs were not looked at"
         findings.append(_Case("clashes", "search", "error", message))
-    suites = {"clashes": findings, "rules": list(_rules(found, asked))}
+    suites = {"clashes": findings, "rules": list(_rules(found, failing))}
     root = Element("testsuites", {"name": "hapticdb clashes", **_counts(chain(*suites.values()))})
     for name, cases in suites.items():
         seconds = f"{found.elapsed if name == 'clashes' else 0.0:.3f}"
@@ -122,10 +122,12 @@ def _finding(group: Group) -> _Case:
     return _Case(f"clashes.{group.kind}", name, "failure", message, _lines(group.pairs))
 
 
-def _rules(found: Clashes, asked: Sequence[Kind]) -> Iterator[_Case]:
+def _rules(found: Clashes, failing: Sequence[Kind]) -> Iterator[_Case]:
     for n, reach in enumerate(found.reach(), start=1):
         name = f"{n}: {rule_text(reach.rule)}"
-        broken = [one for one in found.pairs if one.rule == n and one.is_open and one.kind in asked]
+        broken = [
+            one for one in found.pairs if one.rule == n and one.is_open and one.kind in failing
+        ]
         if broken:
             message = f"{len(broken):,} of {reach.n_pairs:,} pairs do not keep it"
             yield _Case("clashes.rules", name, "failure", message, _lines(broken))
@@ -182,7 +184,7 @@ def _viewpoint(topic: uuid.UUID, one: Clash, pair: tuple[Object, Object], up: in
         _child(component, "OriginatingSystem", "hapticdb")
         _child(component, "AuthoringToolId", obj.name)
     _child(components, "Visibility", DefaultVisibility="true")
-    middle, radius = sight(one, pair)
+    middle, radius = view_of(one, pair)
     towards, upright = turned(TOWARDS, up), np.eye(3)[up]
     upright = upright - (upright @ towards) * towards
     camera = _child(root, "OrthogonalCamera")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.surfaces import sides
+from hapticdb.kernels.surfaces import triangle_bvh
 from hapticdb.kernels.triangles.depth import Solid
 
 if TYPE_CHECKING:
@@ -50,11 +50,11 @@ class Interior:
     def __init__(self, surface: "Surface") -> None:
         self.origin = surface.center
         local = surface.triangles - surface.center
-        tree = sides.triangle_tree(local, surface.bodies)
+        tree = triangle_bvh.triangle_bvh(local, surface.bodies)
         volumes = -(surface.normals * local.mean(axis=1)).sum(axis=1) * surface.areas
         closed = np.unique(surface.bodies[surface.bodies > 0])
         signs = np.where(np.bincount(surface.bodies, volumes)[closed] > 0.0, 1, -1)
-        boxes = sides.body_boxes(local, surface.bodies)[closed]
+        boxes = triangle_bvh.body_boxes(local, surface.bodies)[closed]
         low, high = (
             boxes[:, 0].min(axis=0, initial=np.inf),
             boxes[:, 1].max(axis=0, initial=-np.inf),
@@ -71,7 +71,7 @@ class Interior:
         """
         found, reach = copy(self), float(np.abs(by).max(initial=0.0))
         solid, larger = self.solid, np.array([[-reach], [reach]])
-        tree = sides.refitted(solid.tree, solid.tree.corners + by[solid.tree.faces])
+        tree = triangle_bvh.refitted(solid.tree, solid.tree.corners + by[solid.tree.faces])
         boxes, box = solid.boxes + larger, solid.box + larger
         found.solid = solid._replace(tree=tree, boxes=boxes, box=box)
         return found
@@ -87,5 +87,5 @@ class Interior:
         for body, sign, (low, high) in zip(*solid[1:4], strict=True):
             which = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
             if len(which):
-                count[which] += sign * sides.encloses(solid.tree, body, local[which])
+                count[which] += sign * triangle_bvh.encloses(solid.tree, body, local[which])
         return count > 0

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.surfaces import sides
+from hapticdb.kernels.surfaces import triangle_bvh
 from hapticdb.pointshell.coverage import halves
 
 if TYPE_CHECKING:
@@ -173,8 +173,8 @@ class InscribedBalls:
                 break
 
     @cached_property
-    def _sides(self) -> sides.TriangleTree:
-        return sides.triangle_tree(self._triangles, self._bodies)
+    def _sides(self) -> triangle_bvh.TriangleBVH:
+        return triangle_bvh.triangle_bvh(self._triangles, self._bodies)
 
     def _are_inside(self, images: Floats, face_of: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Whether images (Q, 3) of positions are in their solids; yes for those of open bodies."""
@@ -183,7 +183,7 @@ class InscribedBalls:
         for body, solid in zip(bodies.tolist(), self._solids[firsts].tolist(), strict=True):
             held = np.flatnonzero(solids == solid)
             if body > 0 and len(held):  # what a void encloses is out again
-                is_inside[held] ^= sides.encloses(self._sides, body, images[held])
+                is_inside[held] ^= triangle_bvh.encloses(self._sides, body, images[held])
         return np.asarray(is_inside)
 
     def _shrunk(
@@ -270,7 +270,7 @@ class InscribedBalls:
     def _has_matter(self, local: Floats) -> NDArray[np.bool_]:
         """Whether open surfaces nearly enclose positions (Q, 3): (Q,)."""
         is_open = self._bodies == 0
-        tree = sides.triangle_tree(
+        tree = triangle_bvh.triangle_bvh(
             np.ascontiguousarray(self._triangles[is_open]), self._bodies[is_open]
         )
         directions = np.random.default_rng(60).normal(size=(LINES, 3))
@@ -282,7 +282,7 @@ class InscribedBalls:
         pairs = np.stack([numbers, np.zeros_like(numbers)], axis=1)
         is_crossed = np.zeros(len(numbers), dtype=np.uint8)
         positions = np.ascontiguousarray(local)
-        sides.nesting_kernel(tree, pairs, picks, directions, positions, is_crossed)
+        triangle_bvh.nesting_kernel(tree, pairs, picks, directions, positions, is_crossed)
         return np.asarray(is_crossed.reshape(-1, LINES).mean(axis=1) >= MATTER)
 
 
@@ -298,7 +298,7 @@ def _solids_of(surface: "Surface") -> Ints:
         -(surface.normals * local.mean(axis=1)).sum(axis=1) * surface.areas,
         n_bodies,
     )
-    low, high = sides.body_boxes(local, surface.bodies).swapaxes(0, 1)
+    low, high = triangle_bvh.body_boxes(local, surface.bodies).swapaxes(0, 1)
     solids = np.arange(n_bodies)
     walls = np.flatnonzero(volumes > 0.0)
     walls = walls[walls > 0]
@@ -359,7 +359,7 @@ def _facings(
     away = centers - touched
     distance = np.linalg.norm(away, axis=1)
     inward = away / np.maximum(distance, 1e-300)[:, None]
-    planes, _ = sides.normals_of(pieces)
+    planes, _ = triangle_bvh.normals_of(pieces)
     along = np.einsum("pk,pk->p", planes, inward)
     planes *= np.sign(along)[:, None]
     is_aligned = np.abs(along) > ALIGNED

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.surfaces import sampling
+from hapticdb.kernels.surfaces import blue_noise
 from hapticdb.pointshell.coverage import spacing_of
 from hapticdb.pointshell.inscribed import SLACK, InscribedBalls
 
@@ -37,7 +37,7 @@ no position touches late by more than one inset. Larger: more corners without po
 Floats = NDArray[np.float64]
 
 
-class _Drawn(NamedTuple):
+class _InsetPoints(NamedTuple):
     """Points drawn inward."""
 
     points: Floats  # (N, 3)
@@ -45,9 +45,9 @@ class _Drawn(NamedTuple):
     inset: Floats  # (N,) metres from the sample to its image
 
 
-def draw_inward(
+def sample_inset(
     surface: "Surface", n_points: int, inset: float, rng: np.random.Generator
-) -> _Drawn:
+) -> _InsetPoints:
     """Points spread evenly over the surface and drawn inward by `inset` metres; see the module.
 
     Points of open surfaces without matter behind them stay on the surface.
@@ -55,7 +55,7 @@ def draw_inward(
     balls = InscribedBalls(surface, inset)
     per_point = SAMPLES
     while True:
-        samples, faces = sampling.sample_surface(
+        samples, faces = blue_noise.sample_surface(
             surface.triangles, surface.areas, surface.normals, per_point * n_points, rng
         )
         radius, facing = balls.touching(samples, faces, inset)
@@ -76,7 +76,7 @@ def draw_inward(
     kept = np.flatnonzero(is_kept)
     share = len(kept) / len(samples)
     chosen = kept[_spread(samples[kept], images[kept], faces[kept], surface, n_points, share)]
-    return _Drawn(images[chosen], faces[chosen], radius[chosen])
+    return _InsetPoints(images[chosen], faces[chosen], radius[chosen])
 
 
 def _is_late(samples: Floats, images: Floats, latest: float) -> NDArray[np.bool_]:
@@ -102,4 +102,4 @@ def _spread(
     """
     places = images + 1e-3 * (samples - images)
     spacing = spacing_of(share * float(surface.areas.sum()), n_points)
-    return sampling.spread_points(places, faces, surface.normals, n_points, spacing)
+    return blue_noise.spread_points(places, faces, surface.normals, n_points, spacing)

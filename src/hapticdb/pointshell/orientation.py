@@ -2,8 +2,8 @@
 
 In files, faces may have any winding, may be repeated, and may not share their edges. So corners
 that coincide are joined, faces that share edges form patches of one winding and closed bodies, and
-lines through the patches vote on the side (`kernels.surfaces.sides`). For a patch without votes the
-side is guessed from its shape. docs/decisions/0015 gives the reasons.
+lines through the patches vote on the side (`kernels.surfaces.triangle_bvh`). For a patch without
+votes the side is guessed from its shape. docs/decisions/0015 gives the reasons.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.surfaces import sides as kernels
+from hapticdb.kernels.surfaces import triangle_bvh as kernels
 
 JOIN = 1e-6
 """Distance up to which corners of open edges are joined, as a share of the bounding box's diagonal.
@@ -114,7 +114,7 @@ def _are_within(sides: _Sides, faces: Ints, walls: Ints, triangles: Floats) -> N
         return is_within
     joined = np.unique(sides.body[np.isin(faces, walls).any(axis=1)])
     if joined.any():
-        tree = kernels.triangle_tree(sides.triangles, sides.body)
+        tree = kernels.triangle_bvh(sides.triangles, sides.body)
         for body in joined[joined > 0].tolist():
             is_within |= kernels.encloses(tree, body, triangles.mean(axis=1))
     return is_within
@@ -266,7 +266,7 @@ def _bodies(n_faces: int, edges: _Edges) -> Ints:
 
 def _vote(sides: _Sides) -> Floats:
     """Signs (F,): 1 if the face's normal points inside, -1 if it points outside."""
-    tree = kernels.triangle_tree(sides.triangles, sides.body)
+    tree = kernels.triangle_bvh(sides.triangles, sides.body)
     votes = kernels.side_votes(
         tree, sides.patch, sides.body, sides.areas, sides.centroids, sides.normals
     )
@@ -305,7 +305,7 @@ def _guess(sides: _Sides, signs: Floats) -> None:
     signs[silent] = np.where(flat, np.where(is_outward, -1.0, 1.0), guess)
 
 
-def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
+def _voids(sides: _Sides, tree: "kernels.TriangleBVH") -> NDArray[np.bool_]:
     """Whether each body (B,) is a void's wall: completely inside an odd number of closed bodies."""
     low, high = kernels.body_boxes(sides.triangles, sides.body).swapaxes(0, 1)
     low[0], high[0], n_bodies = np.inf, -np.inf, len(low)  # open bodies enclose nothing

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.surfaces.sides import TriangleTree, normals_of, triangle_tree
+from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH, normals_of, triangle_bvh
 from hapticdb.kernels.triangles.offsets import FLAT
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.orientation import components, faces_of, orient
@@ -42,7 +42,7 @@ class CollisionShape:
 
         surface : the same triangles, if `orient` has seen them; index (T, 3) : as for `faces_of`.
         """
-        self.tree = tree_of(triangles)
+        self.tree = bvh_of(triangles)
         low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         self.box = np.stack([low - radius, high + radius])
         self.radius, self.is_cloud, self.chord = radius, is_cloud, chord
@@ -152,6 +152,6 @@ def _angles(triangles: Floats) -> Floats:
     return np.asarray(np.arctan2(across, (ahead * back).sum(axis=2)))
 
 
-def tree_of(triangles: Floats) -> TriangleTree:
+def bvh_of(triangles: Floats) -> TriangleBVH:
     """BVH over triangles (T, 3, 3) of one surface."""
-    return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))
+    return triangle_bvh(triangles, np.zeros(len(triangles), dtype=np.int64))

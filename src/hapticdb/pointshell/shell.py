@@ -1,8 +1,8 @@
 """PointShell: the moving tool as points on its surface, each with a normal into the tool.
 
 A mesh becomes a shell in three steps: orientation of the faces (`orientation`), sampling of points
-on them (`kernels.surfaces.sampling`), and a sort along a Z-order curve. Successive points are close
-in space, so a frame looks up the same brick many times in a row if it contains many points.
+on them (`kernels.surfaces.blue_noise`), and a sort along a Z-order curve. Successive points are
+close in space, so a frame looks up the same brick many times in a row if it contains many points.
 """
 
 import math
@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb import mesh
 from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels import curves
-from hapticdb.kernels.surfaces import sampling
+from hapticdb.kernels.surfaces import blue_noise
 from hapticdb.pointshell.coverage import Ball, points_for
-from hapticdb.pointshell.inset import draw_inward
+from hapticdb.pointshell.inset import sample_inset
 from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.poses import as_floats
 
@@ -243,9 +243,9 @@ class PointShell:
             n_points = min(max(wanted, DEFAULT_POINTS), most)
         rng = np.random.default_rng(seed)
         if inset > 0.0:
-            sampled, face_of, insets = draw_inward(surface, n_points, inset, rng)
+            sampled, face_of, insets = sample_inset(surface, n_points, inset, rng)
         else:
-            sampled, face_of = sampling.sample_surface(
+            sampled, face_of = blue_noise.sample_surface(
                 surface.triangles, surface.areas, surface.normals, n_points, rng
             )
             insets = np.zeros(n_points)

@@ -1,12 +1,12 @@
-"""Force laws of the API (the paper, section 3); their arithmetic is in `hapticdb.kernels.law`."""
+"""Force laws of the API (the paper, section 3); their arithmetic is in `kernels.force_law`."""
 
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Protocol, get_args
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels import law as kernels
-from hapticdb.kernels.field import law as field
+from hapticdb.kernels import force_law as kernels
+from hapticdb.kernels.field import distance_law as field
 
 LawName = Literal["plane", "distance"]
 LAW_NAMES: tuple[LawName, ...] = get_args(LawName)
@@ -28,7 +28,7 @@ class ForceLaw(Protocol):
 
     @property
     def for_kernels(self) -> Any:  # noqa: ANN401 - a NamedTuple of a type of its own
-        """NamedTuple with functions in `hapticdb.kernels.law`; made once, read by frames."""
+        """NamedTuple with functions in `hapticdb.kernels.force_law`; made once, read by frames."""
 
 
 @dataclass(frozen=True)

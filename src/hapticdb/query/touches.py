@@ -95,8 +95,8 @@ class Touch:
 
     def _felt(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Contacts and their depths; some may be no hits."""
-        is_felt = self.depths > 0
-        points, depths = self.hits[is_felt], self.depths[is_felt]
+        is_included = self.depths > 0
+        points, depths = self.hits[is_included], self.depths[is_included]
         apart, apart_depths = self._apart
         if apart.size:
             points = np.concatenate([points, apart])

@@ -244,7 +244,7 @@ class Recorder(Closes):
                 os.fsync(self._file.fileno())
         finally:
             self._file.close()
-            self._keep_old()
+            self._restore_old()
 
     @contextlib.contextmanager
     def _noting_the_end(self) -> Iterator[None]:
@@ -260,7 +260,7 @@ class Recorder(Closes):
             if start and start[: len(OLDER)] != OLDER and start != MAGIC:
                 raise FileError(f"{self.path} is no recording of hapticdb: give another name")
 
-    def _keep_old(self) -> None:
+    def _restore_old(self) -> None:
         """Remove the new file if no frame was written; the old recording stays."""
         if self._made is not None and self._made != self.path:
             self._made.unlink(missing_ok=True)
@@ -306,7 +306,7 @@ class Recorder(Closes):
             with contextlib.suppress(OSError):
                 self._file.truncate(self._end)
             self._file.close()
-            self._keep_old()
+            self._restore_old()
             raise FileError(
                 f"cannot write {self.path}: {error.strerror}; its first {self._n_written} frames "
                 "are whole"

@@ -108,9 +108,9 @@ class Header:
             ) from None
         object.__setattr__(self, "coupling", coupling)
         object.__setattr__(self, "environment", redact(str(self.environment)))
-        felt = Filter(self.where, self.exclude)
-        exclude = felt.fixed_ids.tolist() if felt.is_fixed else felt.exclude
-        object.__setattr__(self, "where", felt.where)
+        selection = Filter(self.where, self.exclude)
+        exclude = selection.fixed_ids.tolist() if selection.is_fixed else selection.exclude
+        object.__setattr__(self, "where", selection.where)
         object.__setattr__(self, "exclude", tuple(exclude))
         object.__setattr__(self, "revision", int(self.revision))
         object.__setattr__(self, "rate", float(self.rate))

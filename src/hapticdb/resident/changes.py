@@ -51,8 +51,8 @@ def known_cells_touched(
     bits, curve = grid.bits, grid.curve_code
     first, last = spans[:, 0] >> CELL_SHIFT, spans[:, 1] >> CELL_SHIFT
     if (last - first + 1).sum() <= FEW_CELLS:
-        met = np.concatenate([np.arange(a, b + 1) for a, b in zip(first, last, strict=True)])
-        cells = kernels.cells_of_curve_keys(np.unique(met), bits, curve)
+        changed = np.concatenate([np.arange(a, b + 1) for a, b in zip(first, last, strict=True)])
+        cells = kernels.cells_of_curve_keys(np.unique(changed), bits, curve)
         return np.compress(slots_of(cells) != UNKNOWN, cells)
     cells = known()
     on_curve = kernels.curve_keys_of_cells(cells, bits, curve)
@@ -65,17 +65,17 @@ def known_cells_touched(
     return np.compress(np.cumsum(n_holding[:-1]) > 0, cells[order])
 
 
-class LeftOutObjects:
+class FollowedExclusions:
     """Ids of the objects outside of a filter, at the last followed revision.
 
-    felt : its words are read again when an object is added or removed, or has another name or other
-    attributes; a word that chooses nothing any more chooses nothing. ids (E,) : ascending and
+    selection : its words are read again when an object is added or removed, or has another name or
+    other attributes; a word that chooses nothing any more chooses nothing. ids (E,) : ascending and
     distinct.
     """
 
-    def __init__(self, felt: Filter) -> None:
-        self.felt = felt
-        self.ids: Keys = felt.fixed_ids if felt.is_fixed else NO_KEYS
+    def __init__(self, selection: Filter) -> None:
+        self.selection = selection
+        self.ids: Keys = selection.fixed_ids if selection.is_fixed else NO_KEYS
         self._objects: dict[int, Object] = {}
 
     def follow(self, store: Store, changes: Sequence[Change] | None) -> bool:
@@ -83,14 +83,14 @@ class LeftOutObjects:
 
         Returns whether only written objects are felt now and were not before, or the reverse.
         """
-        if self.felt.is_fixed:
+        if self.selection.is_fixed:
             return True
         if changes is None:
             self._objects = {obj.id: obj for obj in store.objects()}
         elif not self._read_again(store, {change.id for change in changes}):
             return True
         objects = [self._objects[i] for i in sorted(self._objects)]
-        before, self.ids = self.ids, self.felt.left_out(objects, store.url).ids
+        before, self.ids = self.ids, self.selection.excluded(objects, store.url).ids
         written = np.array([change.id for change in changes or ()], dtype=np.int64)
         return bool(np.isin(np.setxor1d(before, self.ids), written).all())
 

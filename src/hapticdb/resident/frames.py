@@ -7,17 +7,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.law import felt_within, reads_distances
+from hapticdb.kernels.force_law import force_range, reads_distances
 from hapticdb.kernels.records.cells import MISSED
 from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.cell_frames import evaluate_frames
 from hapticdb.kernels.resident.cells import UNKNOWN, Clusters
-from hapticdb.kernels.resident.feeling import feel_kernel
-from hapticdb.kernels.resident.first_hits import UNDECIDED, find_first_hits
+from hapticdb.kernels.resident.collisions import UNDECIDED, find_first_hits
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
 from hapticdb.query.law import ForceLaw, TangentPlane
-from hapticdb.resident.held import clusters_of
+from hapticdb.resident.point_runs import clusters_of
 from hapticdb.resident.residency import Residency
 
 LEAST_FOUND = 1 << 16
@@ -30,7 +30,7 @@ its points. Larger: fewer lookups and more unused cells."""
 Floats = NDArray[np.float64]
 
 
-class FeltFrames(NamedTuple):
+class FrameResults(NamedTuple):
     """Wrenches and counts of a shell at M poses.
 
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
@@ -120,7 +120,7 @@ class ResidentFrames:
         size = residency.grid.voxel_size
         self.clusters = clusters_of(shell, size, run)
         self.hits = np.empty(len(shell), dtype=np.int64)
-        self.surroundings = _surroundings_of(self.clusters, size, felt_within(self.law))
+        self.surroundings = _surroundings_of(self.clusters, size, force_range(self.law))
         self.missed = np.zeros((), MISSED)
         self._row = table.join()
 
@@ -128,7 +128,7 @@ class ResidentFrames:
         """Free the table's reader row."""
         self.residency.table.leave(self._row)
 
-    def feel(self, poses: ArrayLike) -> FeltFrames:
+    def evaluate(self, poses: ArrayLike) -> FrameResults:
         """Fetch the cells for rigid poses (M, 4, 4) `world_from_tool`; compute wrenches there."""
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros(len(matrices), RESULT)
@@ -137,7 +137,7 @@ class ResidentFrames:
             n_poses = self.fetch(matrices[done:])
             self._run(matrices, out, done, n_poses)
             done += n_poses
-        return FeltFrames(
+        return FrameResults(
             out["wrench"],
             out["hits"].astype(np.int64),
             out["contacts"].astype(np.int64),
@@ -150,8 +150,8 @@ class ResidentFrames:
     ) -> NDArray[np.bool_]:
         """Whether a point is in an occupied voxel at each of poses (M, 4, 4), rigid transforms.
 
-        The poses with hits in `feel` under the plane law. The search of a pose ends at its first
-        hit, and only unknown cells are fetched.
+        The poses with hits in `evaluate` under the plane law. The search of a pose ends at its
+        first hit, and only unknown cells are fetched.
 
         search : finds a point with a hit at each pose, such as `first_hits` in several threads.
         """
@@ -168,13 +168,13 @@ class ResidentFrames:
         """A point (M,) with a hit at each of poses (M, 4, 4), `NOTHING` or `UNDECIDED`."""
         found = np.empty(len(poses), dtype=np.int64)
         cells = self.residency.table.cells.without_distances()
-        find_first_hits(cells, self._row, self.clusters, poses, self.residency.place, found)
+        find_first_hits(cells, self._row, self.clusters, poses, self.residency.cell_grid, found)
         return found
 
     def wrenches(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
         """Wrenches (M, 6) and numbers of hits (M,) at poses, in the form for a replay."""
-        felt = self.feel(poses)
-        return felt.wrenches, felt.hits
+        results = self.evaluate(poses)
+        return results.wrenches, results.hits
 
     def fetch(self, poses: Floats) -> int:
         """Make the cells of the first poses resident; returns the number of these poses."""
@@ -185,8 +185,8 @@ class ResidentFrames:
         for places, reach in ((around.places, around.reach), (self.clusters.points, 0.0)):
             room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
             found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
-            n_poses, count = kernels.cells_met(
-                places, 0, len(places), reach, poses, residency.place, found, most
+            n_poses, count = kernels.cells_in_reach(
+                places, 0, len(places), reach, poses, residency.cell_grid, found, most
             )
             if count <= most:
                 break
@@ -197,8 +197,8 @@ class ResidentFrames:
     def _run(self, poses: Floats, out: NDArray[np.void], start: int, n_poses: int) -> None:
         """Compute the frames at poses start .. start + n_poses - 1, with resident cells."""
         part = slice(start, start + n_poses)
-        done = feel_kernel(
-            self.cells, self._row, self.clusters, poses[part], self.residency.place, self.law,
+        done = evaluate_frames(
+            self.cells, self._row, self.clusters, poses[part], self.residency.cell_grid, self.law,
             self.hits, self.missed, out[part],
         )  # fmt: skip
         if done < n_poses:

@@ -7,9 +7,9 @@ from numba import cuda
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.field.distance_law import DistanceFieldLaw
 from hapticdb.kernels.field.lattice import BEYOND
-from hapticdb.kernels.field.law import DistanceFieldLaw
-from hapticdb.kernels.law import reads_distances
+from hapticdb.kernels.force_law import reads_distances
 from hapticdb.kernels.records.cells import BUFFERS
 from hapticdb.kernels.resident.cells import (
     CELL_WORDS,
@@ -33,7 +33,7 @@ class CellMirror:
 
     law : of the frames that read it, in the kernels' form; side : voxels of the grid on each axis,
     None for the queries of a hand, with directory, masks and payload alone. arrays : keys, slots,
-    words, gate and payload, as `kernels.gpu.frames.frames_under` takes them; n_copied : slots
+    words, gate and payload, as `kernels.gpu.gpu_frames.frames_under` takes them; n_copied : slots
     copied so far. Raises UsageError if the table is larger than the GPU's free memory.
     """
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from hapticdb.errors import GridError, ObjectNotFoundError, UsageError
 from hapticdb.kernels.resident import cell_table as kernels
-from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
-from hapticdb.resident.changes import LeftOutObjects, known_cells_touched, writes_since
+from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, CellGrid
+from hapticdb.resident.changes import FollowedExclusions, known_cells_touched, writes_since
 from hapticdb.resident.source import CellSource
 from hapticdb.resident.table import FIRST_VERSION, CellTable
 from hapticdb.resident.writer import CellWriter, UnpublishedCells
@@ -54,9 +54,9 @@ def check_distances(store: Store, exclude: Keys, changes: Sequence[Change] | Non
         for object_id in {change.id for change in changes if change.action != "remove"}:
             with suppress(ObjectNotFoundError):  # removed by a later write
                 objects.append(store.object(object_id))
-    left_out = set(exclude.tolist())
+    excluded = set(exclude.tolist())
     for obj in objects:
-        if not obj.has_distances and obj.id not in left_out:
+        if not obj.has_distances and obj.id not in excluded:
             raise UsageError(
                 f"object {obj.id} ({obj.name}) of {store.url} has no distances to its surface: "
                 "import it again with distances, or use the law 'plane'"
@@ -110,8 +110,8 @@ class Residency:
         self._revision = NOTHING_KNOWN
         self._commit_count = NOTHING_KNOWN
         is_first = table.version == FIRST_VERSION
-        self._left_out = LeftOutObjects(Filter(where, exclude))
-        self._source = CellSource(store, self._left_out.ids, clock, may_measure=is_first)
+        self._excluded = FollowedExclusions(Filter(where, exclude))
+        self._source = CellSource(store, self._excluded.ids, clock, may_measure=is_first)
         if not is_first:
             self._take_over(urgent)
         self.refresh()
@@ -155,9 +155,9 @@ class Residency:
         return self._source.exclude
 
     @property
-    def place(self) -> Place:
+    def cell_grid(self) -> CellGrid:
         """The grid in the kernels' form."""
-        return Place(*self.grid.origin, self.grid.voxel_size, float(self.grid.side))
+        return CellGrid(*self.grid.origin, self.grid.voxel_size, float(self.grid.side))
 
     @property
     def revision(self) -> int:
@@ -248,8 +248,8 @@ class Residency:
         n_writes, _ = self._follow_writes(NO_KEYS)
         return n_writes
 
-    def _follow_writes(self, asked: Keys) -> tuple[int, UnpublishedCells]:
-        """Update all cells to the last revision, and read the unknown cells `asked` (n,).
+    def _follow_writes(self, requested: Keys) -> tuple[int, UnpublishedCells]:
+        """Update all cells to the last revision, and read the unknown cells `requested` (n,).
 
         The most urgent changed cells are read again, the others are forgotten. So memory and time
         are bounded for any amount of writes. Returns the number of writes, and all cells read.
@@ -257,15 +257,15 @@ class Residency:
         with self.store.snapshot():
             revision = self.store.revision()
             writes = writes_since(self.store, self._revision, revision)
-            only_written = self._left_out.follow(self.store, writes)
-            self._source.exclude = self._left_out.ids
+            only_written = self._excluded.follow(self.store, writes)
+            self._source.exclude = self._excluded.ids
             self._check_distances(writes if only_written else None)
             if writes is None or not only_written:
                 touched = self.writer.known()
             else:
                 touched = known_cells_touched(writes, self.grid, self.slots_of, self.writer.known)
             again = self._urgent[np.isin(self._urgent, touched)][:MOST_RENEWED]
-            read = self._read_all(np.concatenate([asked, again]))
+            read = self._read_all(np.concatenate([requested, again]))
             commit_count = self.store.version()
         self._revision, before = revision, self._revision
         self._commit_count = commit_count

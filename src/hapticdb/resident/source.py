@@ -34,7 +34,7 @@ are merged while they are still in the processor's cache."""
 FAR = 2e-3
 """Greatest round trip (s) for a calibration at the start, of thousands of round trips. Larger:
 slower starts."""
-ASKED = 3
+ROUND_TRIPS = 3
 """Number of timed round trips; the shortest counts."""
 
 
@@ -77,8 +77,8 @@ class CellSource:
         rows = self.store.scan(*ranges, distances=payload is not None)
         cells_of_rows = rows.keys >> (CELL_SHIFT - shift)
         at = np.minimum(np.searchsorted(on_curve, cells_of_rows), len(on_curve) - 1)
-        is_felt = (on_curve[at] == cells_of_rows) & ~np.isin(rows.ids, self.exclude)
-        row_slots = np.where(is_felt, slots[order][at], UNKNOWN)
+        is_included = (on_curve[at] == cells_of_rows) & ~np.isin(rows.ids, self.exclude)
+        row_slots = np.where(is_included, slots[order][at], UNKNOWN)
         words[slots] = 0
         masks[slots] = 0
         kernels.fill_cells(
@@ -144,7 +144,7 @@ def costs_at_start(
 def _round_trip(store: Store, clock: Callable[[], float]) -> float:
     """Seconds until the store answers a small query."""
     times = []
-    for _ in range(ASKED):
+    for _ in range(ROUND_TRIPS):
         started = clock()
         store.revision()
         times.append(clock() - started)

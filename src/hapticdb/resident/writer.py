@@ -18,7 +18,7 @@ from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import NO_KEYS, Keys
 
-PATIENCE = 0.02
+TIMEOUT = 0.02
 """Seconds of waiting for frames of old versions before the writer checks the processes of these
 readers. Larger: a dead reader delays the writer longer."""
 PAUSE = 5e-5
@@ -274,9 +274,9 @@ class CellWriter:
             return NO_KEYS
         known = self._known_empty()
         others = known[~np.isin(known, urgent)]
-        kept_longest = urgent[::-1][np.isin(urgent[::-1], known)]
+        oldest_kept = urgent[::-1][np.isin(urgent[::-1], known)]
         n_leaving = max(surplus, min(surplus + self._most_empty // 8, len(others)))
-        leaving = np.concatenate([others, kept_longest])[:n_leaving]
+        leaving = np.concatenate([others, oldest_kept])[:n_leaving]
         for cell in leaving.tolist():
             self._empty.pop(cell, None)
         return leaving
@@ -290,6 +290,6 @@ class CellWriter:
         waited_since = time.monotonic()
         while self._oldest_version_read() < version:
             time.sleep(PAUSE)
-            if time.monotonic() - waited_since > PATIENCE:
+            if time.monotonic() - waited_since > TIMEOUT:
                 self._table.release_dead()
                 waited_since = time.monotonic()

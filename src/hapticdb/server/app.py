@@ -8,9 +8,9 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.types import ASGIApp
 
-from hapticdb.server.front_page import ClientPage, FrontDoor
+from hapticdb.server.front_page import ClientPage, SignIn
 from hapticdb.server.guards import Guards
-from hapticdb.server.health import Doctor
+from hapticdb.server.health import HealthChecker
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
 
@@ -24,17 +24,17 @@ def application(
     served: Served,
     page: ClientPage,
     relay: Relay,
-    doctor: Doctor,
+    health_checker: HealthChecker,
     *,
     prefix: str,
     title: str,
     host_names: tuple[str, ...] = (),
 ) -> ASGIApp:
     """Application of a server's parts; `prefix`, `title` and `host_names` as of `Serving`."""
-    door = FrontDoor(served.access, page, served.limits, prefix, title)
+    door = SignIn(served.access, page, served.limits, prefix, title)
 
     async def healthz(_: Request) -> Response:
-        health = await doctor.health()
+        health = await health_checker.health()
         return JSONResponse(health.words(), 200 if health.is_well else 503)
 
     async def metrics(request: Request) -> Response:
@@ -42,7 +42,7 @@ def application(
             return PlainTextResponse(
                 "this needs a token, or a request from the same machine\n", 403
             )
-        await doctor.health()  # measures the database
+        await health_checker.health()  # measures the database
         text = await asyncio.to_thread(served.figures.text)  # sessions may be starting
         return Response(text, media_type="text/plain; version=0.0.4")
 

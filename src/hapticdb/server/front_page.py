@@ -173,7 +173,7 @@ POLICY = (
 )
 
 
-class FrontDoor:
+class SignIn:
     """Sign-in and view: the view with a valid cookie, otherwise the form for a token."""
 
     def __init__(

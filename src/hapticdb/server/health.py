@@ -13,7 +13,7 @@ from prometheus_client.registry import Collector
 
 from hapticdb.environment import Environment
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.server.page_keeper import PageKeeper
+from hapticdb.server.page_supervisor import PageSupervisor
 from hapticdb.server.served import Served
 from hapticdb.session.host import SessionHost
 from hapticdb.session.report import LoopFigures
@@ -22,7 +22,7 @@ from hapticdb.store.connect import open_store
 LOG = logging.getLogger("hapticdb.server")
 GOOD_FOR = 1.0
 """Lifetime of a cached result, seconds."""
-PATIENCE = 5.0
+TIMEOUT = 5.0
 """Time limit of the database's response, seconds."""
 
 
@@ -45,24 +45,24 @@ class Health(NamedTuple):
         return {"status": "ok" if self.is_well else "failing"} | parts
 
 
-class Doctor:
+class HealthChecker:
     """Health checks of a server's parts."""
 
-    def __init__(self, served: Served, keeper: PageKeeper) -> None:
-        self._served, self._keeper = served, keeper
+    def __init__(self, served: Served, supervisor: PageSupervisor) -> None:
+        self._served, self._supervisor = served, supervisor
         # a store belongs to one thread
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="health")
         self._env: Environment | None = None
         self._last: tuple[float, Health] | None = None
-        self._asking = asyncio.Lock()
+        self._querying = asyncio.Lock()
 
     async def health(self) -> Health:
         """Health of each part, at most `GOOD_FOR` old."""
-        async with self._asking:
+        async with self._querying:
             now = time.monotonic()
             if self._last is not None and now - self._last[0] < GOOD_FOR:
                 return self._last[1]
-            database, page = await asyncio.gather(self._asked(), self._keeper.answers())
+            database, page = await asyncio.gather(self._is_answered(), self._supervisor.answers())
             are_working = await asyncio.to_thread(self._are_working)
             found = Health(database, self._served.host.failure is None, are_working, page)
             if not found.is_well:
@@ -79,15 +79,15 @@ class Doctor:
         """Whether no session has lost its process."""
         return not any(session.is_over for session in self._served.host.sessions())
 
-    async def _asked(self) -> bool:
+    async def _is_answered(self) -> bool:
         loop = asyncio.get_running_loop()
         try:
-            async with asyncio.timeout(PATIENCE):
-                return await loop.run_in_executor(self._thread, self._ask)
+            async with asyncio.timeout(TIMEOUT):
+                return await loop.run_in_executor(self._thread, self._query_revision)
         except TimeoutError:
             return False
 
-    def _ask(self) -> bool:
+    def _query_revision(self) -> bool:
         """Query the database's revision, in the thread of its connection."""
         try:
             if self._env is None:

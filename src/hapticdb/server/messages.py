@@ -129,7 +129,7 @@ class Verdict(NamedTuple):
     reason: Reason | Literal[""] = ""
 
 
-def judged(message: bytes, role: Role) -> Verdict:
+def validated(message: bytes, role: Role) -> Verdict:
     """Decode a browser's message, and encode it anew if it may pass."""
     if len(message) > LARGEST:
         return Verdict(None, "size")

@@ -16,10 +16,10 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.typing import Subprotocol
 
 from hapticdb.server.access import Access, Role
-from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits, TokenBucket
-from hapticdb.server.messages import judged
-from hapticdb.server.page_keeper import PageKeeper
+from hapticdb.server.messages import validated
+from hapticdb.server.metrics import Metrics
+from hapticdb.server.page_supervisor import PageSupervisor
 
 LOG = logging.getLogger("hapticdb.server")
 VERSION = re.compile(r"viser-v[0-9A-Za-z.+-]{1,32}")
@@ -28,9 +28,9 @@ IDS = re.compile(r"(\d{1,10}(,\d{1,10}){0,49})?")
 """Form of the parts that a link shows."""
 WAITING_MESSAGES = 4
 """Queued messages of the page for one browser."""
-CONNECT_PATIENCE = 5.0
+CONNECT_TIMEOUT = 5.0
 """Time limit of the connection to the page, seconds."""
-CLOSING_PATIENCE = 5.0
+CLOSING_TIMEOUT = 5.0
 """Time limit of a browser's close handshake, seconds."""
 RENEW_EVERY = 60.0
 """Seconds between two checks of a browser's cookie."""
@@ -51,9 +51,9 @@ class Relay:
     """Connections between browsers and the page, within roles and limits, with metrics."""
 
     def __init__(
-        self, access: Access, keeper: PageKeeper, limits: Limits, figures: Figures
+        self, access: Access, supervisor: PageSupervisor, limits: Limits, figures: Metrics
     ) -> None:
-        self._access, self._keeper = access, keeper
+        self._access, self._supervisor = access, supervisor
         self._limits, self._figures = limits, figures
         self._arrivals = TokenBucket(limits.browsers_per_second, limits.browsers_at_once)
         self._numbers: set[int] = set()
@@ -68,7 +68,7 @@ class Relay:
             LOG.info("a browser's connection ends: %s", closing.words)
             if websocket.application_state is not WebSocketState.DISCONNECTED:
                 with contextlib.suppress(RuntimeError, TimeoutError, WebSocketDisconnect):
-                    async with asyncio.timeout(CLOSING_PATIENCE):
+                    async with asyncio.timeout(CLOSING_TIMEOUT):
                         await websocket.close(closing.code, closing.words)
         finally:
             self._figures.connections.labels(reason).inc()
@@ -118,17 +118,17 @@ class Relay:
     ) -> ClientConnection:
         """Connect to the page."""
         try:
-            if not self._keeper.is_ready:
+            if not self._supervisor.is_ready:
                 raise ConnectionError("it is starting")
             return await connect(
-                f"ws://127.0.0.1:{self._keeper.port}/",
-                additional_headers=self._keeper.headers(name, role.word, shown),
+                f"ws://127.0.0.1:{self._supervisor.port}/",
+                additional_headers=self._supervisor.headers(name, role.word, shown),
                 subprotocols=[version],
                 compression=None,  # costs more time than the loopback interface
                 max_size=None,
                 max_queue=WAITING_MESSAGES,
                 ping_interval=None,
-                open_timeout=CONNECT_PATIENCE,
+                open_timeout=CONNECT_TIMEOUT,
                 proxy=None,
             )
         except (OSError, InvalidHandshake, TimeoutError) as error:
@@ -152,7 +152,7 @@ class Relay:
             message = received.get("bytes") or b""
             self._figures.relayed.labels("in").inc(len(message))
             await strict.wait_for(message)
-            verdict = judged(message, role)
+            verdict = validated(message, role)
             if verdict.passed is None:
                 strict.refuse(verdict.reason)
                 continue
@@ -184,7 +184,7 @@ class Relay:
 class _Strictness:
     """Rate limits of one browser: it waits at first, and is disconnected if it continues."""
 
-    def __init__(self, limits: Limits, figures: Figures) -> None:
+    def __init__(self, limits: Limits, figures: Metrics) -> None:
         self._limits, self._figures = limits, figures
         self._messages = TokenBucket(limits.messages_per_second, limits.messages_at_once)
         self._bytes = TokenBucket(limits.bytes_per_second, limits.bytes_at_once)

@@ -12,11 +12,11 @@ from hapticdb.server.access import Access, Role
 from hapticdb.server.limits import Limits
 
 if TYPE_CHECKING:
-    from hapticdb.server.figures import Figures
+    from hapticdb.server.metrics import Metrics
     from hapticdb.session.coupling import Rendering
     from hapticdb.session.host import SessionHost
 
-PAGE = "hapticdb.page.process:work"
+PAGE = "hapticdb.page.page_process:work"
 """Function of the page's process."""
 PREFIX = re.compile(r"(/[A-Za-z0-9_-]+)*")
 """Form of a prefix."""
@@ -101,5 +101,5 @@ class Served:
 
     access: Access
     limits: Limits
-    figures: "Figures"
+    figures: "Metrics"
     host: "SessionHost"

@@ -52,7 +52,7 @@ class AttachedHost(Closes):
         options = {"where": where, "exclude": exclude, "coupling": coupling, "scale": scale}
         if self._is_closed:
             raise UsageError("the host was left: attach to it again")
-        slot, session = self._channel.ask("begin", shell, start, options)
+        slot, session = self._channel.call("begin", shell, start, options)
         return HostedSession(self._shared, slot, session, self._call)
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
@@ -60,7 +60,7 @@ class AttachedHost(Closes):
             if word == "end":
                 return None
             raise UsageError("the host was left: attach to it again")
-        return self._channel.ask("call", word, session, *content)
+        return self._channel.call("call", word, session, *content)
 
     def close(self) -> None:
         """Leave the host; the sessions of this process end."""
@@ -76,13 +76,13 @@ def serve_attached(
     channel = Channel(sock)
     begun: set[int] = set()
 
-    def do(ask: Message, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
-        if ask.word == "begin":
-            shell, start, options = ask.content
+    def do(message: Message, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
+        if message.word == "begin":
+            shell, start, options = message.content
             session = begin(shell, start, **options)
             begun.add(session.id)
             return session.slot, session.id
-        word, number, *content = ask.content
+        word, number, *content = message.content
         return call(word, number, *content)
 
     try:

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from hapticdb.devices.profiles import DeviceProfile
-from hapticdb.devices.stability import allow
+from hapticdb.devices.stability import limit_stiffness
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.pointshell.shell import PointShell
@@ -138,14 +138,14 @@ class Coupling:
     ) -> "SettledCoupling":
         """Coupling of one session, as of `of_session`."""
         profile = self.profile or profile
-        allowed = allow(profile, rate, self.stiffness, self.delay)
+        allowed = limit_stiffness(profile, rate, self.stiffness, self.delay)
         stiffness, lever = allowed.stiffness, radius / scale
         cap = profile.cap if self.cap is None else self.cap
         damping = stiffness * (0.5 / rate + allowed.delay)
         return SettledCoupling(
             profile=profile.name,
             stiffness=stiffness,
-            asked_stiffness=allowed.asked,
+            requested_stiffness=allowed.requested,
             lowered=allowed.lowered,
             cap=cap,
             turn_stiffness=_first(
@@ -206,12 +206,12 @@ class DirectRendering:
 class SettledCoupling(DirectRendering):
     """A `Coupling` of one session: every number is settled. A recording has these.
 
-    asked_stiffness : before it was lowered, N/m at the device; lowered : one line on what lowered
-    it, None if nothing did; others as for `Coupling`.
+    requested_stiffness : before it was lowered, N/m at the device; lowered : one line on what
+    lowered it, None if nothing did; others as for `Coupling`.
     """
 
     stiffness: float
-    asked_stiffness: float
+    requested_stiffness: float
     lowered: str | None
     turn_stiffness: float
     damping: float

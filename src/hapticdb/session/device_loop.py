@@ -28,13 +28,13 @@ from hapticdb.devices.protocol import (
 from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.kernels._jit import ENTRIES
 from hapticdb.kernels.hand.calling import FUNCTION, address_of
-from hapticdb.kernels.hand.handle import is_somewhere
+from hapticdb.kernels.hand.handle_motion import is_valid_pose
 from hapticdb.kernels.period.loop import DEVICE, NOBODY
 from hapticdb.kernels.records.layout import pose_numbers, views_of
 from hapticdb.query.law import ForceLaw
 from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import Rendering
-from hapticdb.session.processes.process import LOOK_EVERY, MessageSender, parent_is_gone
+from hapticdb.session.processes.process import POLL_EVERY, MessageSender, parent_is_gone
 from hapticdb.session.report import LoopAnswer, LoopFigures
 from hapticdb.session.states import PeriodClock, SlotRequest
 from hapticdb.session.timing import Timing, undisturbed
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 EMPTY_SECONDS = 2.0
 """Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
 Larger: the machine's own lateness is measured better, the first frame comes later."""
-WARM_PATIENCE = 30.0
+WARM_TIMEOUT = 30.0
 """Longest wait (s) of the loop for its first cells and for a device's first valid pose."""
 
 
@@ -101,21 +101,21 @@ class DeviceLoop:
         Without a database it does not wait: the supervisor reports that at once.
         """
         started = time.monotonic()
-        session, asked = self.queued, 0
+        session, requested = self.queued, 0
         control = self.table.cells.control
         self._place()
-        while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
+        while time.monotonic() - started < WARM_TIMEOUT and not self._is_left():
             if control["is_lost"]:
                 break
-            if asked and session["heard"] >= asked:
+            if requested and session["heard"] >= requested:
                 if session["n_missing"] == 0:
                     self.is_warm = True
                     break
-                asked = 0
-            if not asked:  # a person's hand has moved while the loop waited
+                requested = 0
+            if not requested:  # a person's hand has moved while the loop waited
                 self._place()
                 self._step(1e-3)
-                asked = int(session["sequence"])
+                requested = int(session["sequence"])
             time.sleep(1e-3)
         self._place()
 
@@ -132,13 +132,13 @@ class DeviceLoop:
 
     def _read(self) -> Reading:
         """Read the hand's pose; wait for the first valid one after the device's opening."""
-        until = time.monotonic() + WARM_PATIENCE
+        until = time.monotonic() + WARM_TIMEOUT
         reading = self.reader.read()
-        while not is_somewhere(reading.pose, reading.velocity):
+        while not is_valid_pose(reading.pose, reading.velocity):
             if time.monotonic() > until or self._is_left():
                 raise DeviceError(
-                    f"the device has not said where it is within {WARM_PATIENCE:g} s: "
-                    f"{self.reader.complaint()}; check its connection and calibration"
+                    f"the device has not said where it is within {WARM_TIMEOUT:g} s: "
+                    f"{self.reader.fault()}; check its connection and calibration"
                 )
             time.sleep(1e-3)
             reading = self.reader.read()
@@ -221,17 +221,17 @@ class DeviceLoop:
         device = self.device
         ends = device if isinstance(device, SupportsEnd) else None
         applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], self.slot["n_frames"]
-        look_every = max(round(LOOK_EVERY * self.timing.rate), 1)
+        poll_every = max(round(POLL_EVERY * self.timing.rate), 1)
 
         def push() -> bool:
             if self.gpu is not None:
                 self.gpu.check()
             device.apply(applied)
             if math.isnan(x.item()) and self.bad_reading is None:
-                self.bad_reading = self.reader.complaint() or None
+                self.bad_reading = self.reader.fault() or None
             if ends is not None and ends.is_over:
                 return True
-            return n_frames.item() % look_every == 0 and parent_is_gone()
+            return n_frames.item() % poll_every == 0 and parent_is_gone()
 
         return push
 

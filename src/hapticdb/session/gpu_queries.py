@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hapticdb.batches.on_gpu import check_gpu
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.kernels.gpu import looks as kernels
+from hapticdb.kernels.gpu import proximity_queries as kernels
 from hapticdb.kernels.hand.calling import FUNCTION, address_of
 from hapticdb.kernels.hand.near_points import (
     FAR,
@@ -25,7 +25,7 @@ from hapticdb.kernels.hand.near_points import (
 from hapticdb.kernels.records.cells import MOST_MISSED
 from hapticdb.kernels.records.hand import QUERY
 from hapticdb.kernels.records.layout import views_of
-from hapticdb.kernels.resident.cells import Place
+from hapticdb.kernels.resident.cells import CellGrid
 from hapticdb.query.law import DISTANCE
 from hapticdb.resident.mirror import CellMirror
 from hapticdb.resident.table import CellTable
@@ -104,29 +104,29 @@ class GpuQueries:
         self._state, self._table = state, table
         self._follower = views_of(state.follower)
         self._tried = state.servo["tool"]["tried_pose"]
-        self._place = Place(*state.slot["place"].tolist())
+        self._place = CellGrid(*state.slot["place"].tolist())
         self._mirror = CellMirror(table, DISTANCE.for_kernels, side=None)
-        self._n_looks, self._epoch = 0, 0
+        self._n_queries, self._epoch = 0, 0
         self._error: BaseException | None = None
         self._stream = cuda.stream()
         self._nothing = cuda.to_device(NOTHING)
         self._found: NDArray[np.float64] = cuda.pinned_array(kernels.FOUND, np.float64)
-        self._asked: NDArray[np.void] = cuda.pinned_array(1, QUERY)
+        self._query: NDArray[np.void] = cuda.pinned_array(1, QUERY)
         self._view = self._view_of(state)
         n_runs = self._view.run_due.size
         self._of_runs = min(-(-n_runs // kernels.THREADS_OF_RUNS), kernels.MOST_BLOCKS)
         self._of_points = min(n_runs, kernels.MOST_BLOCKS)
-        self._kernel = kernels.look_at_runs(kernels.THREADS)
-        self._asked[:] = np.zeros((), QUERY)
-        self._asked["number"], self._asked["run"] = -1, 1
-        self._launch_look()  # compiles them; no run is due yet
+        self._kernel = kernels.query_runs(kernels.THREADS)
+        self._query[:] = np.zeros((), QUERY)
+        self._query["number"], self._query["run"] = -1, 1
+        self._launch_query()  # compiles them; no run is due yet
         self._launch_put_back()
         self._stream.synchronize()
         self._repeat()
         self._called = FUNCTION(self._answer)
-        state.follower["looker"] = address_of(self._called)
+        state.follower["gpu_query"] = address_of(self._called)
 
-    def _view_of(self, state: SessionState) -> kernels.Sight:
+    def _view_of(self, state: SessionState) -> kernels.DeviceView:
         """Memory of the GPU for a tool."""
         clusters, table = state.clusters, self._table
         n_points = len(clusters.points)
@@ -134,7 +134,7 @@ class GpuQueries:
         room = min(n_points, max(ROOM[0], n_points // ROOM[1]))
         points = np.empty((3, n_points + 1))
         points[:, :-1], points[:, -1] = clusters.columns, clusters.center
-        return kernels.Sight(
+        return kernels.DeviceView(
             points=cuda.to_device(points),
             spheres=cuda.to_device(clusters.spheres if len(clusters.spheres) else np.zeros((1, 4))),
             due=cuda.device_array(n_points, np.float64),
@@ -144,7 +144,7 @@ class GpuQueries:
             epochs=cuda.to_device(np.full(n_runs, -1)),
             seen=cuda.to_device(np.zeros(n_runs, np.int64)),
             due_runs=cuda.device_array(n_runs, np.int64),
-            asked=cuda.device_array(1, QUERY),
+            query=cuda.device_array(1, QUERY),
             used=cuda.to_device(np.zeros(table.n_slots, np.uint8)),
             missed=cuda.to_device(np.full(kernels.ROOM_FOR_MISSED, -1)),
             found=cuda.to_device(NOTHING),
@@ -162,23 +162,23 @@ class GpuQueries:
     def _answer(self) -> int:
         """Answer a query; after an error the tool stays until `check`."""
         try:
-            return self._looked()
+            return self._query_near_points()
         except BaseException as error:  # noqa: BLE001 - no kernel can take it
             self._error = error
             return NOT_KNOWN
 
-    def _looked(self) -> int:
-        """Near points at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
+    def _query_near_points(self) -> int:
+        """Near points at the tried pose, as `query_proximity` -> OPEN, SHUT or NOT_KNOWN."""
         follower, state = self._follower, self._state
         self._mirror.update(int(state.cells.readers["version"][state.reader]))
         self._mirror.seen()  # in the arrays that the launches read
-        if self._n_looks % USED_EVERY == 0:
-            self._tell_used()
+        if self._n_queries % USED_EVERY == 0:
+            self._mark_used()
         self._epoch += int(follower.anew) == POINTS_ANEW
         most, half = int(follower.merges_from), 1 - int(follower.side)
         near, bends = state.near_points[half], state.bends[half]
         while True:
-            n_due, n_near, n_unknown, least = self._look_once().tolist()
+            n_due, n_near, n_unknown, least = self._query_once().tolist()
             n, numbers = int(n_near), self._view.points_near
             if n > numbers.size:
                 self._put_back(-1, n_due)
@@ -203,12 +203,12 @@ class GpuQueries:
         bends.view(np.float64).reshape(len(bends), -1)[:n] = rows[:, first:]
         follower.n_tried[()], follower.n_unknown[()] = n, n_unknown
         follower.tried_clearance[()] = least - float(follower.travelled) + FAR
-        self._tell_missed(int(n_unknown))
+        self._list_missed(int(n_unknown))
         return NOT_KNOWN if n_unknown else OPEN
 
     def _first_shut(self, numbers: NDArray[np.int64]) -> int:
         """First forbidden near point; NOBODY without one."""
-        if not self._follower.is_walking:
+        if not self._follower.is_advancing:
             return NOBODY
         before = self._state.kept[numbers]
         u, bound = np.array(self._view.near[:2, : len(numbers)])
@@ -216,31 +216,31 @@ class GpuQueries:
         is_shut |= (bound < LEAST_BOUND) & (bound <= before["bound"])
         return int(numbers[is_shut].min(initial=NOBODY))
 
-    def _look_once(self) -> NDArray[np.float64]:
+    def _query_once(self) -> NDArray[np.float64]:
         """One query at the tried pose -> its result (FOUND,)."""
         follower = self._follower
-        self._n_looks += 1
-        self._asked[0] = (
-            self._n_looks, self._epoch, self._state.clusters.run, follower.is_large,
+        self._n_queries += 1
+        self._query[0] = (
+            self._n_queries, self._epoch, self._state.clusters.run, follower.is_large,
             follower.anew > 0, follower.is_bent, follower.merged, follower.travelled, follower.way,
             self._tried[:3], -1, 0,
         )  # fmt: skip
         follower.anew[()] = 0
-        self._begin_look()
+        self._begin_query()
         self._stream.synchronize()
         return self._found
 
     def _put_back(self, last: int, n_due: float) -> None:
         """Undo the writes of a query beyond a point; a later launch waits for it."""
-        self._asked["last"], self._asked["n_due"] = last, n_due
+        self._query["last"], self._query["n_due"] = last, n_due
         self._begin_put_back()
         self._stream.synchronize()
 
-    def _launch_look(self) -> None:
+    def _launch_query(self) -> None:
         """Launches and copies of a query."""
         place, stream, view = self._place, self._stream, self._view
         seen = self._mirror.seen()._replace(used=view.used)
-        view.asked.copy_to_device(self._asked, stream=stream)
+        view.query.copy_to_device(self._query, stream=stream)
         kernels.list_due_runs[self._of_runs, kernels.THREADS_OF_RUNS, stream](place, seen, view)
         self._kernel[self._of_points, kernels.THREADS, stream](
             place, seen, self._mirror.arrays[-1], view
@@ -250,12 +250,12 @@ class GpuQueries:
 
     def _launch_put_back(self) -> None:
         """Launch and copy of an undo."""
-        self._view.asked.copy_to_device(self._asked, stream=self._stream)
+        self._view.query.copy_to_device(self._query, stream=self._stream)
         kernels.put_back[self._of_runs, kernels.THREADS_OF_RUNS, self._stream](self._view)
 
     def _repeat(self) -> None:
         """Take both with their present arrays."""
-        self._begin_look = _Repeated(self._stream, self._launch_look)
+        self._begin_query = _Repeated(self._stream, self._launch_query)
         self._begin_put_back = _Repeated(self._stream, self._launch_put_back)
 
     def _make_room(self, n: int) -> None:
@@ -267,7 +267,7 @@ class GpuQueries:
         )
         self._repeat()
 
-    def _tell_missed(self, n_unknown: int) -> None:
+    def _list_missed(self, n_unknown: int) -> None:
         """List the query's unknown cells, for the prefetch process."""
         missed, keys = self._state.missed, self._view.missed
         missed["n_cells"] = 0
@@ -277,7 +277,7 @@ class GpuQueries:
             found = np.sort(found[found >= 0])[:MOST_MISSED]
             missed["n_cells"], missed["cells"][: len(found)] = len(found), found
 
-    def _tell_used(self) -> None:
+    def _mark_used(self) -> None:
         """Mark the read cells in the table, so others are evicted."""
         used = self._view.used
         found = used.copy_to_host()

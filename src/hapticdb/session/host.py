@@ -109,12 +109,12 @@ class SessionHost(Closes):
         if not is_rigid(pose):
             raise UsageError("a session starts at a pose (4, 4) that is a rigid transform")
         Handle(scale=scale)  # checks it
-        felt = Filter(where, exclude)
+        selection = Filter(where, exclude)
         with self._changing, ExitStack() as undo:
             if self._is_closed:
                 raise UsageError("the host is closed: make another")
             undo.callback(self._free_tables)
-            cells = self._cells_of(felt)
+            cells = self._cells_of(selection)
             law = DISTANCE if cells.has_distances else PLANE
             if self._rendering == "coupled" and law is PLANE:
                 raise UsageError(without_distances(self.url, "leave out --rendering coupled"))
@@ -129,7 +129,7 @@ class SessionHost(Closes):
             hand = np.array(row_of_pose(pose))
             self._shared.slots["hand_pose"][running.slot] = hand
             table = cells.table
-            worker.ask(
+            worker.call(
                 "begin", running.request, hand, id(cells), table.n_slots,
                 descriptors=[table.descriptor],
             )  # fmt: skip
@@ -137,20 +137,23 @@ class SessionHost(Closes):
             undo.pop_all()
         return HostedSession(self._shared, running.slot, number, self._call)
 
-    def _cells_of(self, felt: Filter) -> ResidentCells:
+    def _cells_of(self, selection: Filter) -> ResidentCells:
         """Table of a filter's objects, made when first needed."""
-        if felt not in self._tables:
-            self._tables[felt] = ResidentCells(
-                self.url, budget_bytes=self._budget_bytes, where=felt.where, exclude=felt.exclude
+        if selection not in self._tables:
+            self._tables[selection] = ResidentCells(
+                self.url,
+                budget_bytes=self._budget_bytes,
+                where=selection.where,
+                exclude=selection.exclude,
             )
-        return self._tables[felt]
+        return self._tables[selection]
 
     def _free_tables(self) -> None:
         """Free the tables that no session uses."""
         used = [running.cells for running in self._supervisor.sessions.values()]
-        for felt, cells in list(self._tables.items()):
+        for selection, cells in list(self._tables.items()):
             if cells not in used:
-                del self._tables[felt]
+                del self._tables[selection]
                 cells.close()
 
     def _least_busy(self, law: ForceLaw, rendering: Rendering) -> WorkerProcess:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.hand.handle import FARTHEST
+from hapticdb.kernels.hand.handle_motion import FARTHEST
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import row_of_pose
 from hapticdb.recording.frame import Frames, State

@@ -16,7 +16,7 @@ from hapticdb.poses import poses_of
 from hapticdb.query.law import reads_distances
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.held import clusters_of
+from hapticdb.resident.point_runs import clusters_of
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import radius_of
@@ -163,12 +163,12 @@ class _Again:
     def _around(self, frames: Frames) -> NDArray[np.int64]:
         """Cells around the recorded tools, as many as half the table holds."""
         grid = self._residency.grid
-        ways = (poses_of(frames["tool"]) @ self._center)[:, :3]
-        ways = (ways - np.array(grid.origin)) / grid.voxel_size
-        if not np.isfinite(ways).all():
+        centers = (poses_of(frames["tool"]) @ self._center)[:, :3]
+        centers = (centers - np.array(grid.origin)) / grid.voxel_size
+        if not np.isfinite(centers).all():
             return np.empty(0, np.int64)
-        margin = float(np.linalg.norm(ways - ways[0], axis=1).max()) + LONGEST_REST + FAR
-        around = PrefetchRequest(ways[0], np.zeros(3), self._radius / grid.voxel_size, margin)
+        margin = float(np.linalg.norm(centers - centers[0], axis=1).max()) + LONGEST_REST + FAR
+        around = PrefetchRequest(centers[0], np.zeros(3), self._radius / grid.voxel_size, margin)
         return np.sort(around.cells(grid)[0][: self._table.n_slots // 2])
 
     def _run(self, frames: Frames) -> NDArray[np.int64]:
@@ -217,7 +217,7 @@ class _Comparison:
             )
             differs |= (then != now).any(axis=1)
         if self._parting is None:
-            self._look_for_reasons(recorded)
+            self._find_reasons(recorded)
             if differs.any():
                 n = int(np.argmax(differs))
                 at = self._n_frames + n
@@ -228,7 +228,7 @@ class _Comparison:
         self._n_differing += int(differs.sum())
         self._n_frames += len(recorded)
 
-    def _look_for_reasons(self, frames: Frames) -> None:
+    def _find_reasons(self, frames: Frames) -> None:
         """Find the first frames with a reason for a difference."""
         now, times = self._residency.revision, frames["time"]
         begun = times[0] - frames["dt"][0] if self._last is None else self._last

@@ -103,10 +103,10 @@ class Report:
         bounded the wrench.
     is_warm : bool
         Whether all wanted cells were resident before the first frame; after
-        `hapticdb.session.device_loop.WARM_PATIENCE` a session starts without them.
+        `hapticdb.session.device_loop.WARM_TIMEOUT` a session starts without them.
     cache : CacheFigures
         Figures of the prefetch process.
-    objects, loose_objects : tuple of int
+    objects, enclosing_objects : tuple of int
         Ids of objects touched, and of those that the tool lay in; sampled a hundred times a second.
     recorded_frames, lost_records : int
         Frames in the recording, and frames that were overwritten before they were recorded.
@@ -119,7 +119,7 @@ class Report:
         a contact (a point below its tangent plane or, with distances, below the onset); with a
         point in a cell that was not resident; that kept an earlier wrench; in which the database
         had not answered for too long.
-    nowhere_frames : int
+    invalid_frames : int
         Frames with an invalid reading: numbers not finite or too large, or no rotation.
     bad_reading : str or None
         One line on the first invalid reading: the device, what it returned, what was expected.
@@ -128,10 +128,10 @@ class Report:
     deepest : float
         Deepest contact, metres: below the tangent plane, or, with distances, within the distance at
         which contact begins.
-    loose_frames, first_loose_frame : int
+    inside_frames, first_inside_frame : int
         With distances. Frames in which the tool lay in an object and felt nothing, since it began
         there or a part was put upon it; number of the first of them from 0, or -1 without any.
-    ended_loose : bool
+    ended_inside : bool
         Whether the tool still lay in something at the end.
     guard_actions : int
         How often the guard lowered the stiffness because the force went back and forth.
@@ -150,7 +150,7 @@ class Report:
     is_warm: bool
     cache: CacheFigures
     objects: tuple[int, ...]
-    loose_objects: tuple[int, ...]
+    enclosing_objects: tuple[int, ...]
     recorded_frames: int
     lost_records: int
     recording_ended: str | None
@@ -160,14 +160,14 @@ class Report:
     unknown_frames: int
     held_frames: int
     stale_frames: int
-    nowhere_frames: int
+    invalid_frames: int
     bad_reading: str | None
     peak_force: float
     peak_torque: float
     deepest: float
-    loose_frames: int
-    first_loose_frame: int
-    ended_loose: bool
+    inside_frames: int
+    first_inside_frame: int
+    ended_inside: bool
     guard_actions: int
     least_share: float
     conditions: dict[str, str]
@@ -183,8 +183,8 @@ class Report:
 
 def counts_of(slot: NDArray[np.void]) -> dict[str, Any]:
     """Counts of a session's slot, a row of `SLOT`, by their names in a `Report`."""
-    told = {one.name for one in fields(Report)}
-    names = [n for n in slot.dtype.names or () if n in told and not slot.dtype[n].shape]
+    reported = {one.name for one in fields(Report)}
+    names = [n for n in slot.dtype.names or () if n in reported and not slot.dtype[n].shape]
     counts = {name: slot[name].item() for name in names}
-    counts["ended_loose"] = bool(slot["ended_loose"])
-    return counts if slot["loose_frames"] else counts | {"first_loose_frame": -1}
+    counts["ended_inside"] = bool(slot["ended_inside"])
+    return counts if slot["inside_frames"] else counts | {"first_inside_frame": -1}

@@ -18,7 +18,7 @@ from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.states import SlotRequest
 from hapticdb.session.worker import WorkerProcess
 
-END_PATIENCE = 5.0
+END_TIMEOUT = 5.0
 """Seconds until the loop must have left an ending session; normally one period."""
 
 
@@ -72,7 +72,7 @@ class Running(Closes):
         settled = (coupling or Coupling()).of_session(
             of_worker.rendering, SCRIPTED, of_worker.timing.rate, before.scale, before.radius
         )
-        self.worker.ask("set_coupling", self.slot, settled)
+        self.worker.call("set_coupling", self.slot, settled)
         self.request = replace(self.request, coupling=settled)
 
     def record(self, path: str, is_replaced: bool) -> None:  # noqa: FBT001 - of a call
@@ -84,7 +84,7 @@ class Running(Closes):
         recording = Recorder(path, replace=is_replaced)
         try:
             recording.open()
-            self.begin_recording(recording, *self.worker.ask("save", self.slot))
+            self.begin_recording(recording, *self.worker.call("save", self.slot))
         except BaseException:
             recording.discard()
             raise
@@ -122,14 +122,14 @@ class Running(Closes):
                 recording.finish()
         return Recorded(0, 0) if recording is None else Recorded(len(recording), recording.n_lost)
 
-    def ask_to_end(self) -> None:
+    def request_end(self) -> None:
         """Make the loop leave the session after its next frame: the one way in which one ends."""
         self.shared.slots["is_asked_to_end"][self.slot] = True
 
     def end(self) -> Recorded:
         """End the session and its recording, and give slot and reader row back."""
-        self.ask_to_end()
-        worker, until = self.shared.slots["worker"], time.monotonic() + END_PATIENCE
+        self.request_end()
+        worker, until = self.shared.slots["worker"], time.monotonic() + END_TIMEOUT
         with self:
             try:
                 while worker[self.slot] and self._worker is not None and self._worker.is_alive:

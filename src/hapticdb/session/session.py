@@ -23,19 +23,19 @@ from hapticdb.session.report import LoopAnswer, Report, counts_of
 from hapticdb.session.running import Running
 from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.states import FOREVER
-from hapticdb.session.supervisor import LOOK_EVERY, Supervisor
+from hapticdb.session.supervisor import POLL_EVERY, Supervisor
 from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerProcess, WorkerRequest
 
 if TYPE_CHECKING:
-    from hapticdb.batches.feeler import BatchDevice
+    from hapticdb.batches.batch_tool import BatchDevice
 
 RING_SECONDS = 4.0
 """Seconds of frames in the ring until they are recorded. Larger: longer pauses of this process lose
 no frame, at more memory."""
 LEAST_RING = 1024
 """Least number of frames in the ring, however low the rate."""
-END_PATIENCE = 10.0
+END_TIMEOUT = 10.0
 """Seconds from a request until the report must have come; normally one frame."""
 DEFAULT_STALENESS = 1.0
 """Default of `staleness`, seconds without an answer of the database."""
@@ -163,10 +163,10 @@ class Session(Closes):
                 self.close()
             raise
 
-    def _check_distances(self, asked: ForceLaw | LawName | None) -> None:
+    def _check_distances(self, requested: ForceLaw | LawName | None) -> None:
         if not reads_distances(self.law) or self.cells.has_distances:
             return
-        if asked is None:
+        if requested is None:
             instead = "feel tangent planes directly with --law plane"
             raise UsageError(without_distances(self.cells.url, instead))
         raise UsageError(
@@ -229,9 +229,9 @@ class Session(Closes):
         return last is not None and bool(last["state"][0] & State.IN_OBJECT)
 
     @property
-    def loose_objects(self) -> tuple[int, ...]:
+    def enclosing_objects(self) -> tuple[int, ...]:
         """Ids of objects around the tool so far; sampled a hundred times a second."""
-        return tuple(sorted(self._running.loose_objects if self._running else ()))
+        return tuple(sorted(self._running.enclosing_objects if self._running else ()))
 
     @property
     def recording_ended(self) -> str | None:
@@ -256,7 +256,7 @@ class Session(Closes):
                 raise self._supervisor.failure
             is_alive = process.is_alive  # read first: the last message may come with the end
             left = until - time.monotonic()
-            message = process.receive(min(LOOK_EVERY, max(left, 0.0)))
+            message = process.receive(min(POLL_EVERY, max(left, 0.0)))
             if message is not None:
                 self._report = self._reported(message.content)
             elif not is_alive:
@@ -267,18 +267,18 @@ class Session(Closes):
                 return None
         return self._report
 
-    def ask_to_end(self) -> None:
+    def request_end(self) -> None:
         """Make the loop end after its next frame. `wait` then returns the report."""
-        self._open.ask_to_end()
+        self._open.request_end()
 
     def stop(self) -> Report:
         """End the session; returns its report."""
-        self.ask_to_end()
-        report = self.wait(END_PATIENCE)
+        self.request_end()
+        report = self.wait(END_TIMEOUT)
         if report is None:
             device = type(self._device).__name__
             raise DeviceError(
-                f"{device}: a call of read() or apply() takes longer than {END_PATIENCE:g} s; "
+                f"{device}: a call of read() or apply() takes longer than {END_TIMEOUT:g} s; "
                 "check its connection and its driver"
             )
         return report
@@ -299,7 +299,7 @@ class Session(Closes):
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,
-            loose_objects=self.loose_objects,
+            enclosing_objects=self.enclosing_objects,
             recorded_frames=recorded.frames,
             recording_ended=self.recording_ended,
             database_lost=self.database_lost,
@@ -336,7 +336,7 @@ class _DeviceSession(Running):
     def __init__(self, *given: Any) -> None:  # noqa: ANN401 - as of `Running`
         super().__init__(*given)
         self.objects: set[int] = set()
-        self.loose_objects: set[int] = set()
+        self.enclosing_objects: set[int] = set()
         self._n_seen, self._has_touched = 0, False  # touched since it last lay in something
 
     def take_frames(self) -> None:
@@ -347,22 +347,22 @@ class _DeviceSession(Running):
 
     def _list_objects(self) -> None:
         done, ring = self.n_frames, self.shared.rings[self.slot]
-        asked = self.cells.table.queue.requests[self.request.reader]
-        named = set(asked["objects"][: int(asked["n_objects"])].tolist())
+        answers = self.cells.table.queue.requests[self.request.reader]
+        named = set(answers["objects"][: int(answers["n_objects"])].tolist())
         frames = ring[np.arange(max(self._n_seen, done - len(ring)), done) % len(ring)]
         self._n_seen = done
         last = self.shared.last_frame(self.slot)
         if last is not None and last["state"][0] & State.IN_OBJECT:
-            self.loose_objects |= named
+            self.enclosing_objects |= named
             self._has_touched = False
             return
         self._has_touched |= bool((frames["hits"] | frames["contacts"]).any())
         # before the first contact an answer about the place where the tool lay may be left
-        self.objects |= named if self._has_touched else named - self.loose_objects
+        self.objects |= named if self._has_touched else named - self.enclosing_objects
 
     def end_process(self) -> None:
         """End the loop and its process, which sets the device's force to zero."""
-        self.ask_to_end()
+        self.request_end()
         if self._worker is not None:
             self._worker.end()
 

@@ -29,7 +29,7 @@ survives longer pauses of the host's process, and each session takes more memory
 QUICK_ATTEMPTS = 100
 """Attempts without a pause to read an unfinished row: writing takes microseconds, unless a busy
 machine stops the writer in the middle."""
-READ_PATIENCE = 1.0
+READ_TIMEOUT = 1.0
 """Seconds of further attempts. Larger: a busier machine is borne, and a writer's death delays a
 reader for longer."""
 READ_PAUSE = 5e-4
@@ -139,7 +139,7 @@ def _bytes_a_slot(ring: int) -> int:
 def _attempts() -> Iterator[None]:
     """Attempts to read a row during a possible write, until patience ends."""
     yield from repeat(None, QUICK_ATTEMPTS)
-    end = time.monotonic() + READ_PATIENCE
+    end = time.monotonic() + READ_TIMEOUT
     while time.monotonic() < end:
         time.sleep(READ_PAUSE)
         yield
@@ -147,6 +147,6 @@ def _attempts() -> Iterator[None]:
 
 def _unreadable() -> HapticDBError:
     return HapticDBError(
-        f"a frame stayed unfinished for {READ_PATIENCE:g} s: the session's worker process has died "
+        f"a frame stayed unfinished for {READ_TIMEOUT:g} s: the session's worker process has died "
         "or does not get to run; end the session and begin another"
     )

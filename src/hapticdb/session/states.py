@@ -16,12 +16,12 @@ from hapticdb.kernels.records.cells import MISSED
 from hapticdb.kernels.records.hand import BENDS, FRAME, NEAR, POINT, RESULT
 from hapticdb.kernels.records.layout import pose_numbers
 from hapticdb.kernels.records.session import LOOP_CLOCK, SLOT
-from hapticdb.kernels.resident.cells import Cells, Clusters, Place
+from hapticdb.kernels.resident.cells import CellGrid, Cells, Clusters
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, reads_distances
 from hapticdb.recording.frame import Frames
 from hapticdb.recording.header import Start
-from hapticdb.resident.held import clusters_of
+from hapticdb.resident.point_runs import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import DirectRendering, Rendering, rendering_of
 
@@ -30,7 +30,7 @@ LARGE_FROM = 4096
 points. The results are the same: a larger value only costs time."""
 STALENESS_NS = 1_000_000_000
 """Longest silence (ns) of the database before all cells count as unknown for hosted hands."""
-LEAVE_PATIENCE = 5.0
+LEAVE_TIMEOUT = 5.0
 """Seconds until the loop must have left an ending session; normally one period."""
 FOREVER = 1e9
 """Seconds for "no limit": thirty years."""
@@ -89,8 +89,8 @@ class SessionState:
                 slot[name][field] = 0 if array is None else array.ctypes.data
         for field, value in (
             ("reader", reader), ("request", request.ctypes.data), ("staleness", STALENESS_NS),
-            ("place", Place(*grid.origin, grid.voxel_size, float(grid.side))), ("bits", grid.bits),
-            ("curve", grid.curve_code), ("n_readers", len(cells.readers)),
+            ("place", CellGrid(*grid.origin, grid.voxel_size, float(grid.side))),
+            ("bits", grid.bits), ("curve", grid.curve_code), ("n_readers", len(cells.readers)),
             ("n_slots", len(cells.used)), ("capacity", cells.keys.shape[1]),
             ("n_points", n_points), ("n_spheres", len(clusters.spheres)),
             ("n_groups", len(clusters.groups)), ("run", clusters.run),
@@ -119,14 +119,14 @@ class SessionState:
 
     def restore(self, saved: Start) -> None:
         """Continue from a result of `save`, for the same tool and build."""
-        looker, parts = (
-            self.follower["looker"].copy(),
+        gpu_query, parts = (
+            self.follower["gpu_query"].copy(),
             (self.servo, self.follower, self.kept, self.near_points, self.bends),
         )
         for part, content in zip(parts, saved, strict=True):
             if content:
                 part[...] = np.frombuffer(content, part.dtype).reshape(part.shape)
-        self.follower["looker"] = looker
+        self.follower["gpu_query"] = gpu_query
 
     def arrive_at(self, pose: NDArray[np.float64]) -> None:
         """Take the hand from the slot's client; its first pose is (7,)."""
@@ -158,7 +158,7 @@ class PeriodClock:
         mover = loop.move_by_coupling if is_coupled else loop.move_directly
         record["worker"], record["mover"] = worker, address_of_kernel(mover, loop.MOVER)
         if not is_coupled:
-            record["feeler"], record["law"], self._law = loop.feeler_of(law.for_kernels)
+            record["batch_tool"], record["law"], self._law = loop.feeler_of(law.for_kernels)
         self._arguments = (self.slots, rings, record)
         self._times = record["due"], record["begun"], record["dt"]
 
@@ -181,7 +181,7 @@ class PeriodClock:
         """Run no more periods of a session; the loop of another thread leaves it within two."""
         state.slot["worker"] = 0
         periods = self._record["periods"]
-        last, until = int(periods) + 2, time.monotonic() + LEAVE_PATIENCE
+        last, until = int(periods) + 2, time.monotonic() + LEAVE_TIMEOUT
         while int(periods) < last:
             if time.monotonic() > until:
                 raise HapticDBError("a worker's loop hangs: end the host")

@@ -12,7 +12,7 @@ from hapticdb.session.running import Running
 from hapticdb.session.shared_table import SharedTable
 
 LOG = logging.getLogger("hapticdb.session")
-LOOK_EVERY = 0.05
+POLL_EVERY = 0.05
 """Seconds between two checks of recordings and processes. Larger: less work, and a death is noticed
 later. A recording loses frames from 2 s on."""
 
@@ -33,16 +33,16 @@ class Supervisor(Closes):
         # two, because a slow start of a process must delay no recording
         self._threads = [
             threading.Thread(target=self._repeat, args=(look,), daemon=True, name="supervisor")
-            for look in (self._look_after_sessions, self._look_after_cells)
+            for look in (self._supervise_sessions, self._supervise_cells)
         ]
         for thread in self._threads:
             thread.start()
 
     def _repeat(self, look: Callable[[], None]) -> None:
-        while not self._is_closed.wait(LOOK_EVERY):
+        while not self._is_closed.wait(POLL_EVERY):
             look()
 
-    def _look_after_sessions(self) -> None:
+    def _supervise_sessions(self) -> None:
         for running in list(self.sessions.values()):
             with self._surviving("recording a session"):
                 if running.worker.is_alive:
@@ -50,7 +50,7 @@ class Supervisor(Closes):
                 else:
                     self.shared.lose(running.slot, running.session)
 
-    def _look_after_cells(self) -> None:
+    def _supervise_cells(self) -> None:
         for cells in self._cells():
             with self._surviving("starting a prefetch process again"):
                 try:

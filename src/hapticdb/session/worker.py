@@ -23,19 +23,19 @@ from hapticdb.session.coupling import DirectRendering, Rendering
 from hapticdb.session.device_loop import DeviceRequest, run_device
 from hapticdb.session.processes.channel import Message
 from hapticdb.session.processes.process import (
-    LOOK_EVERY,
+    POLL_EVERY,
     MessageSender,
     Process,
     parent_is_gone,
     reply_to_parent,
 )
 from hapticdb.session.shared_table import SharedTable
-from hapticdb.session.states import LEAVE_PATIENCE, PeriodClock, SessionState, SlotRequest
+from hapticdb.session.states import LEAVE_TIMEOUT, PeriodClock, SessionState, SlotRequest
 from hapticdb.session.timing import Timing, undisturbed
 
 WORK = "hapticdb.session.worker:work"
 """Function of a worker process."""
-ANSWER_PATIENCE = 30.0
+ANSWER_TIMEOUT = 30.0
 """Seconds for the answer to a command; normally milliseconds."""
 
 
@@ -68,11 +68,11 @@ class WorkerProcess(Process):
             descriptors.append(request.alone.table.descriptor)
         super().__init__(WORK, request, descriptors, with_kernels=True)
         self.ready = self.await_ready("worker")
-        self._channel.sock.settimeout(ANSWER_PATIENCE)
+        self._channel.sock.settimeout(ANSWER_TIMEOUT)
 
-    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
-        """Send a command and wait for its answer; see `Channel.ask`."""
-        return self._channel.ask(word, *content, descriptors=descriptors)
+    def call(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
+        """Send a command and wait for its answer; see `Channel.call`."""
+        return self._channel.call(word, *content, descriptors=descriptors)
 
 
 class Worker:
@@ -90,18 +90,18 @@ class Worker:
         """Take commands until the parent ends; the work of the main thread."""
         try:
             while not parent_is_gone():
-                reply_to_parent(self._do, LOOK_EVERY)
+                reply_to_parent(self._do, POLL_EVERY)
                 self._forget_ended()
         except (EOFError, OSError):
             pass
         finally:
             self._clock.stop()
 
-    def _do(self, ask: Message, descriptors: list[int]) -> object:
+    def _do(self, message: Message, descriptors: list[int]) -> object:
         known: dict[str, Callable[..., object]] = {
             "begin": self._begin, "save": self._save, "set_coupling": self._set_coupling,
         }  # fmt: skip
-        return known[ask.word](*descriptors, *ask.content)
+        return known[message.word](*descriptors, *message.content)
 
     def _begin(
         self,
@@ -161,4 +161,4 @@ def work(request: WorkerRequest, sender: MessageSender) -> None:
     looping.start()
     sender.send("ready", None)
     worker.obey()
-    looping.join(LEAVE_PATIENCE)
+    looping.join(LEAVE_TIMEOUT)

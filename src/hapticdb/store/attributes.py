@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hapticdb.store.base import Object
 
 AXES = ("x", "y", "z")
-MOST_TOLD = 5
+MOST_NAMES = 5
 """Values or names of attributes in an error, at most."""
 
 
@@ -60,8 +60,8 @@ def attribute_hint(objects: Sequence[Object], word: str) -> str:
 
 
 def _some(texts: Sequence[str]) -> str:
-    shown = ", ".join(repr(text[:40]) for text in texts[:MOST_TOLD])
-    more = len(texts) - MOST_TOLD
+    shown = ", ".join(repr(text[:40]) for text in texts[:MOST_NAMES])
+    more = len(texts) - MOST_NAMES
     return f"{shown} and {more} more" if more > 0 else shown
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, Grid
-from hapticdb.store.pairs import Ids, KeptPairs, MaybeMark, Outlines, PairRow, Rule
+from hapticdb.store.pairs import Ids, MaybeMark, Outlines, PairRow, Rule, StoredPairs
 from hapticdb.units import length_text, notebook_html, place_text
 
 Layout = Literal["voxel", "brick"]
@@ -250,7 +250,8 @@ class LocatedShell(NamedTuple):
 
     placed (N + 1, 6) float64 : points in metres and normals, world frame; last row: the tool's
     centre.
-    addresses (N,) int64 : of the points' voxels, -1 outside the grid; from `kernels.query.contact`.
+    addresses (N,) int64 : of the points' voxels, -1 outside the grid; from
+    `kernels.query.shell_keys`.
     stiffness : N/m.
     exclude (E,) int64 : ids of objects without force.
     """
@@ -441,7 +442,7 @@ class Store(Protocol):
 
     # -- pairs of objects; they change no revision -------------------------------------------------
 
-    def pairs(self) -> KeptPairs:
+    def pairs(self) -> StoredPairs:
         """All rows, and the mark, in one statement."""
 
     def put_pairs(

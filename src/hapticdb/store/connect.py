@@ -13,7 +13,7 @@ from hapticdb.store.engines import (
     Url,
     engine_of,
 )
-from hapticdb.store.refusals import wants_distances
+from hapticdb.store.store_errors import wants_distances
 from hapticdb.store.urls import redact
 
 

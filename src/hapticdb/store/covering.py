@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
-from hapticdb.kernels.query import grouping
+from hapticdb.kernels.query import key_ranges
 from hapticdb.store.base import Keys, Layout, Object, row_shift
 
 BOX_CUBES = 16
@@ -42,7 +42,7 @@ def box_ranges(
     high = np.clip(high, 0, grid.side - 1)
     longest = int((high - low).max()) + 1
     finest = max((longest // BOX_CUBES).bit_length(), 3)
-    found = grouping.ranges_of_box(low, high, grid.bits, grid.curve_code, min(finest, grid.bits))
+    found = key_ranges.ranges_of_box(low, high, grid.bits, grid.curve_code, min(finest, grid.bits))
     found >>= row_shift(layout)
     starts = np.flatnonzero(np.append(True, found[1:, 0] > found[:-1, 1] + 1))
     ends = np.append(starts[1:], len(found)) - 1

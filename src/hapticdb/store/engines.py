@@ -116,7 +116,7 @@ def engine_of(url: Url) -> Engine:
             raise MissingExtraError(
                 f"{redact(os.fspath(url))} needs psycopg: install it with {pip_line('postgres')}"
             ) from error
-    return cast("Engine", import_module(f"hapticdb.store.{folder}.store").ENGINE)
+    return cast("Engine", import_module(f"hapticdb.store.{folder}.{folder}_store").ENGINE)
 
 
 def unknown_scheme(scheme: str) -> UsageError:

@@ -12,11 +12,11 @@ from hapticdb.store.finding import MOST_IDS, Listing, Words, checked_words
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
-MOST_KEPT = 16
+MOST_CACHED = 16
 """Filters in a cache, at most."""
 
 
-class Unfelt(NamedTuple):
+class ExcludedObjects(NamedTuple):
     """Objects of one revision excluded from a query.
 
     ids (E,) int64, ascending and distinct; missing : errors of the words without a match.
@@ -63,22 +63,22 @@ class Filter:
         ids = {i for i in self.exclude if isinstance(i, int) and 0 < i < MOST_IDS}
         return np.array(sorted(ids), dtype=np.int64)
 
-    def left_out(self, objects: Sequence[Object], url: str) -> Unfelt:
+    def excluded(self, objects: Sequence[Object], url: str) -> ExcludedObjects:
         """Objects excluded from `objects`, all of one revision by id, and words without a match."""
         missing: list[ObjectNotFoundError] = []
         listing = Listing(objects, url)
         out = {obj.id for obj in _chosen(listing, "exclude", self.exclude, missing)}
         if self.where:
-            felt = {obj.id for obj in _chosen(listing, "where", self.where, missing)}
-            out.update(obj.id for obj in objects if obj.id not in felt)
-        return Unfelt(np.array(sorted(out), dtype=np.int64), tuple(missing))
+            selected = {obj.id for obj in _chosen(listing, "where", self.where, missing)}
+            out.update(obj.id for obj in objects if obj.id not in selected)
+        return ExcludedObjects(np.array(sorted(out), dtype=np.int64), tuple(missing))
 
-    def felt(self, objects: Sequence[Object], url: str) -> list[Object]:
-        """Selected objects, as `left_out`; ObjectNotFoundError for a word without a match."""
-        left_out = self.left_out(objects, url)
-        for error in left_out.missing:
+    def select(self, objects: Sequence[Object], url: str) -> list[Object]:
+        """Selected objects, as `excluded`; ObjectNotFoundError for a word without a match."""
+        excluded = self.excluded(objects, url)
+        for error in excluded.missing:
             raise error
-        ids = set(left_out.ids.tolist())
+        ids = set(excluded.ids.tolist())
         return [obj for obj in objects if obj.id not in ids]
 
 
@@ -116,15 +116,15 @@ class FiltersOfWords:
         words = (tuple(where), tuple(exclude))
         if not {*map(type, words[0]), *map(type, words[1])} <= {int, str}:  # 1 equals True
             return Filter(*words)
-        felt = self._filters.get(words)
-        if felt is None:
-            felt = Filter(*words)
-            keep_last(self._filters, words, felt)
-        return felt
+        found = self._filters.get(words)
+        if found is None:
+            found = Filter(*words)
+            cache_last(self._filters, words, found)
+        return found
 
 
-def keep_last(kept: dict[Key, Value], key: Key, value: Value) -> None:
-    """Store a value under a new key; the oldest of more than `MOST_KEPT` is dropped."""
+def cache_last(kept: dict[Key, Value], key: Key, value: Value) -> None:
+    """Store a value under a new key; the oldest of more than `MOST_CACHED` is dropped."""
     kept[key] = value
-    if len(kept) > MOST_KEPT:
+    if len(kept) > MOST_CACHED:
         del kept[next(iter(kept))]

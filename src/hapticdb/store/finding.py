@@ -12,7 +12,7 @@ from typing import Protocol
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.store.attributes import attribute_hint, having_attribute
 from hapticdb.store.base import Object
-from hapticdb.store.refusals import no_object
+from hapticdb.store.store_errors import no_object
 
 MOST_IDS = 1 << 63
 """Upper bound of ids: signed 64-bit integers in the databases."""

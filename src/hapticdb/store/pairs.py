@@ -95,10 +95,12 @@ class Mark(NamedTuple):
         cls, found: Sequence[tuple[str, int]], was: "MaybeMark", now: "MaybeMark"
     ) -> tuple["MaybeMark", PairRow]:
         """Result of `put_pairs`, and its row of the mark; found : the present row, or none."""
-        held = cls(*found[0]) if found else cls()
-        mark = now if now is not None and held == was else cls(f"written {os.urandom(8).hex()}")
+        found_mark = cls(*found[0]) if found else cls()
+        mark = (
+            now if now is not None and found_mark == was else cls(f"written {os.urandom(8).hex()}")
+        )
         row = PairRow(*MARK, Kind.FAR, 0.0, None, (0.0,) * 6, "same", mark.revision, mark.setting)
-        return (mark if held == was else None), row
+        return (mark if found_mark == was else None), row
 
 
 MaybeMark = Mark | None
@@ -106,7 +108,7 @@ Ids = Sequence[tuple[int, int]]
 """Ids of pairs, the lesser one first."""
 
 
-class KeptPairs:
+class StoredPairs:
     """Rows of the table from one read, each checked on use.
 
     rows : from the engine, by a and b: `COLUMNS`, because and shapes; checked : converts one to a
@@ -134,15 +136,15 @@ class KeptPairs:
     def __iter__(self) -> Iterator[PairRow]:
         return map(self._checked, self.rows)
 
-    def parted(self, ids: Container[int]) -> tuple["KeptPairs", "KeptPairs"]:
+    def parted(self, ids: Container[int]) -> tuple["StoredPairs", "StoredPairs"]:
         """Rows of pairs with one of these objects, and the other rows."""
         some = [row for row in self.rows if row[A] in ids or row[B] in ids]
         others = [row for row in self.rows if row[A] not in ids and row[B] not in ids]
-        return KeptPairs(some, self._checked), KeptPairs(others, self._checked)
+        return StoredPairs(some, self._checked), StoredPairs(others, self._checked)
 
-    def none(self) -> "KeptPairs":
+    def none(self) -> "StoredPairs":
         """The same without rows."""
-        return KeptPairs((), self._checked)
+        return StoredPairs((), self._checked)
 
 
 class Outlines(NamedTuple):

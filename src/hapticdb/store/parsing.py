@@ -30,7 +30,7 @@ from hapticdb.store.base import (
     Rows,
 )
 from hapticdb.store.pairs import SAYS, STATUSES, Outlines, PairRow, Rule
-from hapticdb.store.refusals import made_before
+from hapticdb.store.store_errors import made_before
 from hapticdb.verdicts import Kind
 
 KEY_END = 1 << 63
@@ -142,7 +142,7 @@ def _pieces(data: NDArray[np.uint8], ends: NDArray[np.int64]) -> Iterator[bytes 
         yield joined[start:end] or None
 
 
-def wish_of(url: str, stored: object) -> bool:
+def distances_wanted(url: str, stored: object) -> bool:
     """Whether imports compute distances, from a number 0 or 1, or a boolean."""
     if stored not in {0, 1}:
         raise damaged(url, "whether it wants distances is neither yes nor no")
@@ -253,7 +253,7 @@ def change_of(url: str, row: Sequence[Any]) -> Change:
 
 
 def surfaces_of(url: str, rows: Iterable[Sequence[Any]]) -> dict[str, bytes]:
-    """Parse packed surfaces (digest, geometry); `hapticdb.mesh.packing` validates the bytes."""
+    """Parse packed surfaces (digest, geometry); `mesh.surface_packing` validates the bytes."""
     found = {}
     for digest, geometry in rows:
         if not (isinstance(digest, str) and isinstance(geometry, bytes)):
@@ -331,7 +331,7 @@ def figures_of(url: str, text: object) -> Mapping[str, float]:
     return cast("Mapping[str, float]", figures)
 
 
-def findings_of_kept(
+def findings_of_stored(
     url: str, histograms: Iterable[Sequence[Any]], costs: Iterable[Sequence[Any]]
 ) -> Iterator[str]:
     """Faults of stored histograms (bounds, n_rows) and cost figures (text,), a line each."""

@@ -37,14 +37,14 @@ from hapticdb.store.pairs import (
     HELD,
     MARK,
     Ids,
-    KeptPairs,
     Mark,
     MaybeMark,
     Outlines,
     PairRow,
     Rule,
+    StoredPairs,
 )
-from hapticdb.store.refusals import check_unwritten, no_object, present_already
+from hapticdb.store.store_errors import check_unwritten, no_object, present_already
 
 Result = TypeVar("Result")
 Form = Literal["lookup", "lookup_one", "scan", "rows_of", "after"]
@@ -63,12 +63,12 @@ DROP_SURFACE = """
 DELETE FROM surface
  WHERE digest = %s AND NOT EXISTS (SELECT 1 FROM object WHERE digest = %s)"""
 LAST_REVISION = "(SELECT coalesce(max(revision), 0) FROM change)"
-KEEP_HISTOGRAM = """
+SAVE_HISTOGRAM = """
 INSERT INTO quantile VALUES (%s, %s, %s, %s) ON CONFLICT (resolution) DO UPDATE
    SET revision = excluded.revision, n_rows = excluded.n_rows, bounds = excluded.bounds
  WHERE quantile.revision <= excluded.revision"""
 RULES = "SELECT one, other, says, kinds, length, because FROM rule ORDER BY number"
-KEEP_COSTS = """
+SAVE_COSTS = """
 INSERT INTO cost VALUES (%s, %s) ON CONFLICT (machine) DO UPDATE SET figures = excluded.figures"""
 
 
@@ -126,7 +126,7 @@ class Tables(ABC):
         """Rows of a reading statement; binary : in the engine's own format, if faster."""
 
     @abstractmethod
-    def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
+    def _read(self, form: Form, *arguments: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
         """Rows of a query; none for no keys."""
 
     @abstractmethod
@@ -244,8 +244,8 @@ class Tables(ABC):
     def surface_digests(self) -> set[str]:
         return parsing.digests_of(self.url, self._rows("SELECT digest FROM surface"))
 
-    def pairs(self) -> KeptPairs:
-        return KeptPairs(self._rows(ALL, binary=True), partial(parsing.pair_of, self.url))
+    def pairs(self) -> StoredPairs:
+        return StoredPairs(self._rows(ALL, binary=True), partial(parsing.pair_of, self.url))
 
     def rules(self) -> tuple[Rule, ...]:
         return tuple(parsing.rule_of(self.url, row) for row in self._rows(RULES))
@@ -403,8 +403,8 @@ class Tables(ABC):
         freshness = self.freshness(resolution)
         if anew or freshness.revision is None or freshness.changes:
             revision, n_rows, bounds = self._measured(resolution)
-            told = None if bounds is None else self._packed(bounds)
-            self._save(KEEP_HISTOGRAM, (resolution, revision, n_rows, told))
+            packed = None if bounds is None else self._packed(bounds)
+            self._save(SAVE_HISTOGRAM, (resolution, revision, n_rows, packed))
 
     def _measured(self, resolution: int) -> tuple[int, int, Keys | None]:
         """Revision, rows and bounds of a new histogram; None for statistics of the server."""
@@ -416,7 +416,7 @@ class Tables(ABC):
     def findings(self) -> Iterator[str]:
         kept = self._rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
         costs = self._rows(f"SELECT figures{self.AS_TEXT} FROM cost")
-        yield from parsing.findings_of_kept(self.url, kept, costs)
+        yield from parsing.findings_of_stored(self.url, kept, costs)
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         text = f"SELECT figures{self.AS_TEXT} FROM cost WHERE machine = %s"
@@ -424,4 +424,4 @@ class Tables(ABC):
         return parsing.figures_of(self.url, kept[0][0]) if kept else None
 
     def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
-        self._save(KEEP_COSTS, (machine, json.dumps(dict(figures))))
+        self._save(SAVE_COSTS, (machine, json.dumps(dict(figures))))

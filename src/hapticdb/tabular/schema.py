@@ -9,7 +9,7 @@ from typing import Any
 FIELDS = {
     "Clash": "a a_name b b_name kind at_least at_most places=place status because rule volume",
     "CheckReport": (
-        "is_sound url findings n_findings objects voxels rows surfaces wrong strays lacks_pairs"
+        "is_sound url findings n_findings objects voxels rows surfaces wrong orphans lacks_pairs"
     ),
     "Difference": (
         "is_equal a b is_same_grid with_distances objects=compared voxels=n_voxels renumbered"
@@ -17,12 +17,12 @@ FIELDS = {
     "Disassembly": "verdict parts steps failed is_out_of_time elapsed=seconds seed",
     "Distance": "a=a.id a_name=a.name b=b.id b_name=b.name at_least at_most on_a on_b",
     "Extraction": (
-        "verdict parts to way near blockers pulls motions looks=poses is_planned "
+        "verdict parts to path near blockers pulls motions queries=poses is_planned "
         "is_out_of_time elapsed=seconds seed"
     ),
     "FailedSearch": "parts after_steps=n_gone verdict reason blockers",
     "FileReport": (
-        "file=link status present restored kept_removed replaced dropped chord_error=chord "
+        "file=link status present restored still_removed replaced dropped chord_error=chord "
         "is_unit_assumed defects notes error"
     ),
     "LoopFigures": "frames seconds missed lateness elapsed rate",
@@ -32,10 +32,10 @@ FIELDS = {
     "Replayed": "is_equal frames=n_frames differing=n_differing revision parting",
     "Swept": (
         "verdict gap=gap.at_least gap_at_most=gap.at_most chord_error=gap.error nearest=gap.place "
-        "comes_out hits touching enclosed undecided contact overlap objects looks revision elapsed "
-        "is_stopped length=path.length notes"
+        "comes_out hits touching enclosed undecided contact overlap objects queries revision "
+        "elapsed is_stopped length=path.length notes"
     ),
-    "WayOut": "how poses length gap proof=swept",
+    "RemovalPath": "how poses length gap proof=swept",
 }
 """Fields of a result in JSON, by its class, in the form of `record`; other classes give all."""
 OBJECT = "id name link voxels bounds transform digest attributes revision"
@@ -92,9 +92,9 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - a part of a result
 
 def record(value: object, names: str | Iterable[str]) -> dict[str, Any]:
     """Fields of a result, by name or ``name=path.of.attributes``; `object` adds its own fields."""
-    told: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for text in names.split() if isinstance(names, str) else names:
         name, _, path = text.partition("=")
         one = plain(attrgetter(path or name)(value))
-        told |= one if name == "object" else {name: one}
-    return told
+        values |= one if name == "object" else {name: one}
+    return values

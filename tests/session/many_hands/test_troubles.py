@@ -12,7 +12,7 @@ from typing import NoReturn
 
 import pytest
 
-from children import PATIENCE, joined, until
+from children import TIMEOUT, joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
 from hapticdb.recording.file import Recorder
@@ -85,9 +85,9 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
     try:
         channel.receive()
         with pytest.raises(HapticDBError, match="its log says why") as found:
-            channel.ask("begin", None, None, {})
+            channel.call("begin", None, None, {})
         assert "/secret" not in str(found.value)
-        assert [channel.ask("begin", "a tool", None, {})[1] for _ in range(2)] == [1, 2]
+        assert [channel.call("begin", "a tool", None, {})[1] for _ in range(2)] == [1, 2]
     finally:
         channel.close()
         joined(thread)
@@ -146,7 +146,7 @@ def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
 
     def wait(felt: Filter) -> ResidentCells:
         is_slow.set()
-        assert may_go_on.wait(PATIENCE)
+        assert may_go_on.wait(TIMEOUT)
         return cells_of(felt)
 
     session.record(tmp_path / "slow.hdbrec")
@@ -159,7 +159,7 @@ def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
         thread = threading.Thread(target=begin)
         thread.start()
         try:
-            assert is_slow.wait(PATIENCE)
+            assert is_slow.wait(TIMEOUT)
             is_recorded_further(host, session)
             assert len(host.cells) == 1
             os.kill(host.pids[0], signal.SIGKILL)

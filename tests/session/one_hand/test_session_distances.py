@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import Coupling, Environment, Handle, PointShell, TangentPlane
 from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
@@ -61,7 +61,7 @@ def felt(
         staleness=NEVER_STALE,
         **options,  # type: ignore[arg-type]
     ) as session:
-        report = session.wait(PATIENCE)
+        report = session.wait(TIMEOUT)
     assert report is not None
     return report
 
@@ -82,7 +82,7 @@ def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
     # a sphere of 300 points touches with a point that lies up to a fifth of a millimetre higher
     assert report.peak_force == pytest.approx(4.0, abs=0.4)
     assert report.objects == (1,)
-    assert report.loose_frames == report.unknown_frames == 0
+    assert report.inside_frames == report.unknown_frames == 0
     frames = recorded(tmp_path / "s.hdbrec")
     assert not frames["applied"][0].any()
     assert not frames["applied"][-1].any()
@@ -148,9 +148,9 @@ def test_a_tool_that_starts_in_something_feels_nothing_until_it_is_free(
 ) -> None:
     report = felt(cells, ball, still(SIZE * (HEIGHT - 32.0)), seconds=0.3)
     assert report.peak_force == 0.0
-    assert report.loose_frames == report.loop.frames
-    assert (report.first_loose_frame, report.ended_loose) == (0, True)
-    assert (report.loose_objects, report.objects) == ((1,), ())
+    assert report.inside_frames == report.loop.frames
+    assert (report.first_inside_frame, report.ended_inside) == (0, True)
+    assert (report.enclosing_objects, report.objects) == ((1,), ())
 
 
 def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_when(
@@ -167,18 +167,18 @@ def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_whe
     with Session(
         cells, ball, hand, rate=RATE, staleness=NEVER_STALE, record=tmp_path / "s.hdbrec"
     ) as session:
-        until(lambda: session.is_loose and session.loose_objects == (1,), session)
+        until(lambda: session.is_loose and session.enclosing_objects == (1,), session)
         hand.path.touch()
-        report = session.wait(PATIENCE)
+        report = session.wait(TIMEOUT)
         assert not session.is_loose
     assert report is not None
     frames = recorded(tmp_path / "s.hdbrec")
     is_loose = frames["state"] & State.IN_OBJECT > 0
-    assert report.loose_frames == np.count_nonzero(is_loose) > 0
-    assert is_loose[: report.loose_frames].all()
+    assert report.inside_frames == np.count_nonzero(is_loose) > 0
+    assert is_loose[: report.inside_frames].all()
     assert not frames["applied"][is_loose].any()
-    assert (report.first_loose_frame, report.ended_loose) == (0, False)
-    assert (report.loose_objects, report.objects) == ((1,), (1,))
+    assert (report.first_inside_frame, report.ended_inside) == (0, False)
+    assert (report.enclosing_objects, report.objects) == ((1,), (1,))
     assert report.peak_force == pytest.approx(4.0, abs=0.4)
 
 

@@ -12,7 +12,7 @@ from hapticdb.kernels.records.session import SLOT
 from hapticdb.kernels.resident.cell_table import publish
 from hapticdb.query.law import DISTANCE, PLANE
 from hapticdb.recording.frame import State
-from hapticdb.resident.held import clusters_of
+from hapticdb.resident.point_runs import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.session import Session

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import Environment, PointShell
 from hapticdb.devices.scripted import Player
 from hapticdb.query.law import PLANE, LawName
@@ -54,7 +54,7 @@ def felt(ground: Ground, shell: PointShell, path: Path) -> Report:
         ground.cells, shell, hand, law=ground.law, rate=RATE, record=path, staleness=NEVER_STALE,
         has_baseline=False,
     ) as session:  # fmt: skip
-        report = session.wait(PATIENCE)
+        report = session.wait(TIMEOUT)
     assert report is not None
     return report
 

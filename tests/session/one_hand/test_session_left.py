@@ -150,8 +150,8 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
 def test_a_device_that_hangs_is_named_when_its_session_ends(
     voxel_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "END_PATIENCE", 0.1)
-    monkeypatch.setattr(process, "END_PATIENCE", 0.1)
+    monkeypatch.setattr(module, "END_TIMEOUT", 0.1)
+    monkeypatch.setattr(process, "END_TIMEOUT", 0.1)
     hand = Slow(still(0.03), 50, 60.0)
     with Session(voxel_floor.url, sphere, hand, law="plane", has_baseline=False) as begun:
         until(lambda: begun.n_frames > 5)
@@ -175,7 +175,7 @@ def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
     voxel_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
-        monkeypatch.setattr(process, "START_PATIENCE", 0.0)
+        monkeypatch.setattr(process, "START_TIMEOUT", 0.0)
         for environment, name in ((voxel_floor.url, "prefetch"), (cells, "worker")):
             with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s"):
                 Session(environment, sphere, still(0.03), law="plane")

@@ -51,7 +51,7 @@ class Side:
         self, pose: Pose, velocity: NDArray[np.float64] | None = None
     ) -> tuple[list[int], bytes, int]:
         """Run a frame, write the state; return the frame's hits, wrench and unknown points."""
-        found = self.reader.feel(pose)
+        found = self.reader.evaluate(pose)
         told, missed = self.session["prefetch"], self.reader.missed
         told["is_active"], told["radius"] = True, RADIUS_M
         told["tool"] = told["handle"] = pose[:3, 3]
@@ -252,7 +252,7 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
     step.fetcher.reopen()
     step.warm_start()
     naive = touch_of_shell(ids_by_voxel(world), world.grid, sphere, step.pose)
-    assert step.side.reader.feel(step.pose)[0] == naive.hits
+    assert step.side.reader.evaluate(step.pose)[0] == naive.hits
 
 
 def test_the_heartbeat_waits_for_an_answer(
@@ -345,12 +345,12 @@ def test_a_process_brings_in_what_is_told_and_notices_writes(
     side.be_at(pose)
     until(lambda: side.is_served)
     naive = touch_of_shell(ids_by_voxel(world), world.grid, sphere, pose)
-    assert side.reader.feel(pose)[0] == naive.hits
+    assert side.reader.evaluate(pose)[0] == naive.hits
     with hapticdb.open(world.url) as editor:
         move(editor.store, 1, block((240, 240, 240), (270, 270, 256)))
         naive = touch_of_shell(ids_by_voxel(editor), world.grid, sphere, pose)
     assert len(naive.hits) > 10
-    until(lambda: side.reader.feel(pose)[0] == naive.hits)
+    until(lambda: side.reader.evaluate(pose)[0] == naive.hits)
     figures = resident.figures()
     assert figures.resident > 0
     assert figures.restarts == figures.losses == 0

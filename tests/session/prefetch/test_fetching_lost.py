@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import hapticdb
-from children import PATIENCE
+from children import TIMEOUT
 from hapticdb import Environment, PointShell
 from hapticdb.errors import GridError
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
@@ -21,7 +21,7 @@ from hapticdb.session.prefetch import resident_cells
 from hapticdb.session.prefetch.fetching import Fetcher, FetchRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.processes.process import Process
-from hapticdb.store.sqlite.file import remove_file
+from hapticdb.store.sqlite.database_file import remove_file
 from naive_frame import touch_of_shell
 from session.prefetch.test_fetching import Side, until
 from session.worlds import block, ids_by_voxel, make
@@ -73,7 +73,7 @@ def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
     until(lambda: cells.database_lost)
     (tmp_path / "elsewhere").rename(env.url)
     until(lambda: not cells.database_lost)
-    until(lambda: side.reader.feel(pose)[0] == naive.hits)
+    until(lambda: side.reader.evaluate(pose)[0] == naive.hits)
     assert (cells.figures().losses, cells.restarts) == (1, 0)
 
 
@@ -83,14 +83,14 @@ def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
     """Also when the new file gets the old inode number: both have the same revision."""
     pose = np.eye(4)
     side = served(cells, sphere, pose)
-    before, revision = side.reader.feel(pose)[0], env.store.revision()
+    before, revision = side.reader.evaluate(pose)[0], env.store.revision()
     os.kill(cells.pid, signal.SIGKILL)
-    assert cells._process.wait(PATIENCE)
+    assert cells._process.wait(TIMEOUT)
     other = replace(env, tmp_path / "other")
     assert other.store.revision() == revision
     naive = touch_of_shell(ids_by_voxel(other), other.grid, sphere, pose)
     assert naive.hits != before
-    until(lambda: side.reader.feel(pose)[0] == naive.hits, cells.supervise)
+    until(lambda: side.reader.evaluate(pose)[0] == naive.hits, cells.supervise)
     assert cells.restarts == 1
 
 
@@ -103,7 +103,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         fetching = Fetcher(FetchRequest(env.url, table, env.grid))
         side.be_at(pose)
         until(lambda: side.is_served, fetching.round)
-        before, grid = side.reader.feel(pose)[0], env.grid
+        before, grid = side.reader.evaluate(pose)[0], env.grid
         env.close()
         remove_file(Path(env.url))
         with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
@@ -116,7 +116,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         fetching.reopen()
         side.be_at(pose)
         until(lambda: side.is_served, fetching.round)
-        assert side.reader.feel(pose)[0] == naive.hits
+        assert side.reader.evaluate(pose)[0] == naive.hits
         fetching.close()
 
 
@@ -143,7 +143,7 @@ def test_threads_that_supervise_together_start_one_process(
     cells: ResidentCells, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     os.kill(cells.pid, signal.SIGKILL)
-    assert cells._process.wait(PATIENCE)
+    assert cells._process.wait(TIMEOUT)
     started: list[Process] = []
     barrier = threading.Barrier(4)
 
@@ -152,7 +152,7 @@ def test_threads_that_supervise_together_start_one_process(
         return started[-1]
 
     def supervise(_: int) -> None:
-        barrier.wait(PATIENCE)
+        barrier.wait(TIMEOUT)
         cells.supervise()
 
     monkeypatch.setattr(resident_cells, "Process", noted)

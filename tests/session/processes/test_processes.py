@@ -13,7 +13,7 @@ from types import ModuleType
 
 import pytest
 
-from children import PATIENCE, child, finished
+from children import TIMEOUT, child, finished
 from hapticdb.errors import DatabaseError, HapticDBError, UsageError
 from hapticdb.resident.table import is_alive
 from hapticdb.session.processes import process as module
@@ -22,7 +22,7 @@ from hapticdb.session.processes.process import Process
 from session.sessions import until
 
 WORKERS = "session.processes.workers:work"
-LONG = PATIENCE
+LONG = TIMEOUT
 
 
 @pytest.fixture(autouse=True)
@@ -96,11 +96,11 @@ def test_a_request_of_the_script_itself_is_refused_with_the_way_out(
 def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "END_PATIENCE", 0.5)
+    monkeypatch.setattr(module, "END_TIMEOUT", 0.5)
     for word in ("wait", "measure", "hang"):
         process = Process(WORKERS, (word, None), [])
         assert process.receive(LONG) is not None
-        monkeypatch.setattr(module, "END_PATIENCE", 0.5 if word == "hang" else LONG)
+        monkeypatch.setattr(module, "END_TIMEOUT", 0.5 if word == "hang" else LONG)
         process.end()
         assert not process.is_alive
         process.end()
@@ -158,7 +158,7 @@ def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
         assert session.stdout is not None
         pid, forked = map(int, session.stdout.readline().split())
         session.kill()
-        session.wait(PATIENCE)
+        session.wait(TIMEOUT)
         try:
             until(lambda: not is_alive(pid))
         finally:

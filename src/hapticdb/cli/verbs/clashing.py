@@ -9,8 +9,8 @@ import typer
 
 import hapticdb
 from hapticdb.cli import render
-from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.emit import TableOutput, new_files, open_csv
+from hapticdb.cli.selection import opened_to_store
 from hapticdb.cli.values import MIB, Point, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import AXES, plain
@@ -18,8 +18,8 @@ from hapticdb.units import length_text, place_text
 from hapticdb.verdicts import REPORTED, Kind
 
 if TYPE_CHECKING:
+    from hapticdb.clashes.clash_results import Clash, Clashes
     from hapticdb.clashes.groups import Group
-    from hapticdb.clashes.result import Clash, Clashes
     from hapticdb.environment import Environment
     from hapticdb.exact.moving_clash import Meeting
 
@@ -140,14 +140,14 @@ def clashes(
         refuse("with --poses and --turn", output, "html junit bcf")
         _moved(url, pairs, motion, output)
     refuse("without --poses and --turn", motion)
-    from hapticdb.clashes.result import PAIR_KEYS
+    from hapticdb.clashes.clash_results import PAIR_KEYS
     from hapticdb.clashes.rules import add_rules
-    from hapticdb.clashes.run import accept_pairs
+    from hapticdb.clashes.search import accept_pairs
 
     with (
         open_csv(output.csv, (*PAIR_KEYS, "group")) as table,
         new_files(html=output.html, junit=output.junit, bcf=output.bcf) as files,
-        opened_to_keep(url) as env,
+        opened_to_store(url) as env,
     ):
         add_rules(env.store, meant.rule or (), pairs.within, meant.rules)
         with render.bar("measuring", "pairs") as progress:
@@ -160,25 +160,25 @@ def clashes(
                 from hapticdb.clashes.volumes import with_volumes
 
                 found = with_volumes(env.store, found, meant.least_volume)
-            told = _Told.of(env, found, kinds, meant.group)
+            findings = _Findings.of(env, found, kinds, meant.group)
             if files:
                 from hapticdb.pictures.reports import write_reports
 
-                write_reports(files, env, found, told.pairs, told.groups, kinds)
+                write_reports(files, env, found, findings.pairs, findings.groups, kinds)
         if because is not None:
-            accept_pairs(env.store, [*told.ids], found.known, because or None)
-            _say_accepted([*told.ids], because, output)
+            accept_pairs(env.store, [*findings.ids], found.known, because or None)
+            _say_accepted([*findings.ids], because, output)
             return
         if table is not None:
-            table.add(*told.records())
-    told.say(url, output, is_grouped=meant.group is None and not meant.all_)
+            table.add(*findings.records())
+    findings.say(url, output, is_grouped=meant.group is None and not meant.all_)
     raise typer.Exit(_exit_code(found, kinds))
 
 
 clashes.__doc__ = HELP
 
 
-class _Told(NamedTuple):
+class _Findings(NamedTuple):
     """Printed results of a search; ids : of groups, by pairs of object ids."""
 
     found: "Clashes"
@@ -189,11 +189,11 @@ class _Told(NamedTuple):
     @classmethod
     def of(
         cls, env: "Environment", found: "Clashes", kinds: tuple[Kind, ...], group: str | None
-    ) -> "_Told":
+    ) -> "_Findings":
         """Pairs of some kinds, or of one group; UsageError for an unknown group."""
         from hapticdb.clashes.groups import groups_of
 
-        pairs = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
+        pairs = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_unmeasured]
         groups = groups_of(env.store, pairs)
         if group is not None:
             groups = [one for one in groups if one.id == group]
@@ -225,19 +225,20 @@ class _Told(NamedTuple):
 
 def _moved(url: str, pairs: PairOptions, motion: TurnOptions, output: _Output) -> None:
     """Print the meetings of moving parts with others, and exit."""
-    from hapticdb.clashes.result import ASKED
+    from hapticdb.clashes.clash_results import DEFAULT_KINDS
 
     kinds = pairs.kinds
     with open_csv(output.csv, MEETINGS) as table:
-        told = [one for one in _meetings(url, pairs, motion) if not kinds or one.kind in kinds]
-        output.add(table, *map(plain, told))
+        findings = [one for one in _meetings(url, pairs, motion) if not kinds or one.kind in kinds]
+        output.add(table, *map(plain, findings))
     if output.has_words:
         rows = [(one.id, one.name, f"{one.begin:.4g}", f"{one.end:.4g}", one.kind,
-                 length_text(one.at_least) if one.at_least else "-") for one in told]  # fmt: skip
+                 length_text(one.at_least) if one.at_least else "-")
+                for one in findings]  # fmt: skip
         unit = "pose" if motion.turn is None else "degrees"
         render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
-        render.say(f"{render.counted(len(told), 'meeting')} on the way")
-    raise typer.Exit(int(any(one.kind in (kinds or ASKED) for one in told)))
+        render.say(f"{render.counted(len(findings), 'meeting')} on the way")
+    raise typer.Exit(int(any(one.kind in (kinds or DEFAULT_KINDS) for one in findings)))
 
 
 def _meetings(url: str, pairs: PairOptions, motion: TurnOptions) -> "list[Meeting]":
@@ -275,7 +276,7 @@ def _meetings(url: str, pairs: PairOptions, motion: TurnOptions) -> "list[Meetin
 
 
 def _exit_code(found: "Clashes", kinds: tuple[Kind, ...]) -> int:
-    if any(not one.is_left for one in (found.of(kinds) if kinds else found.of())):
+    if any(not one.is_unmeasured for one in (found.of(kinds) if kinds else found.of())):
         return 1
     return NOT_DECIDED if found.left else 0
 
@@ -306,15 +307,15 @@ def _millimetres(place: tuple[float, ...] | None) -> str:
     return "" if place is None else place_text((1e3 * x for x in place[:3]), 0.1)
 
 
-def _show_pairs(told: "list[Clash]") -> None:
+def _show_pairs(findings: "list[Clash]") -> None:
     """Print the gravest pairs."""
     rows = (
         (one.a, one.a_name or "(gone)", one.b, one.b_name or "(gone)", one.kind,
          one.length_text(), one.because or one.status)
-        for one in told
+        for one in findings
     )  # fmt: skip
     headings = ("id>", "object", "id>", "and", "are", "by>", "status")
-    render.table(headings, rows, len(told), "pairs; --csv writes all")
+    render.table(headings, rows, len(findings), "pairs; --csv writes all")
 
 
 def _show_facts(found: "Clashes", groups: "list[Group]") -> None:

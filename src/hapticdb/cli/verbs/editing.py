@@ -1,8 +1,8 @@
 """Verbs for editing an environment: move, remove."""
 
-from hapticdb.cli.choosing import chosen
 from hapticdb.cli.emit import Output
 from hapticdb.cli.root import left_at
+from hapticdb.cli.selection import chosen
 from hapticdb.cli.values import Point, numbers_of
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import OBJECT, record

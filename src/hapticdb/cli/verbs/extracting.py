@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import FilterOptions, ids_of
 from hapticdb.cli.emit import Output
+from hapticdb.cli.selection import FilterOptions, ids_of
 from hapticdb.cli.values import MIB, pose_of, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import plain
@@ -19,7 +19,7 @@ from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.extraction.disassembly import Disassembly
-    from hapticdb.extraction.result import Extraction
+    from hapticdb.extraction.extraction_results import Extraction
 
 MOST_BLOCKERS = 10
 """Rows of the table of blockers, and of the table of failed searches."""
@@ -111,14 +111,14 @@ def extract(
     order: OrderOptions,
     to: str | None = None,
     search: SearchOptions,
-    felt: FilterOptions,
+    selection: FilterOptions,
     budget: int = 256 * MIB,
     output: _Output,
 ) -> None:
     """See `HELP`."""
     import hapticdb
     from hapticdb.extraction.disassembly import disassemble
-    from hapticdb.extraction.run import extract as search_way
+    from hapticdb.extraction.removal_search import extract as search_path
 
     if to:
         refuse("with --to", order, "disassemble")
@@ -131,17 +131,21 @@ def extract(
     steps: list[tuple[Extraction, Sequence[int]]]
     with hapticdb.open(url, read_only=True) as env:
         ids = ids_of(env, objects, "WORDS")
-        chosen = felt.felt(env, ids)
+        chosen = selection.resolve(env, ids)
         kept = ids_of(env, order.keep, "--keep") if order.keep else []
         with render.bar("pulling", "searches" if order.on else "pulls") as progress:
             options |= {"where": chosen.where, "progress": progress}
             if order.disassemble:
-                more: dict[str, Any] = {"exclude": felt.exclude or (), "keep": kept, "on": order.on}
+                more: dict[str, Any] = {
+                    "exclude": selection.exclude or (),
+                    "keep": kept,
+                    "on": order.on,
+                }
                 found = disassemble(env, *ids, **more, **options)
                 steps = [(step.found, step.excluded) for step in found.steps if found.is_found]
             else:
-                found = search_way(env, *ids, exclude=chosen.exclude, **options)
-                steps = [(found, chosen.left_out)] if found.way else []
+                found = search_path(env, *ids, exclude=chosen.exclude, **options)
+                steps = [(found, chosen.excluded)] if found.path else []
         _report(env, found, steps, output)
     raise typer.Exit(found.verdict.exit_status)
 
@@ -157,15 +161,15 @@ def _report(
 
     steps : results with a path, each with the ids of the objects excluded from it.
     """
-    from hapticdb.extraction.result import Extraction
+    from hapticdb.extraction.extraction_results import Extraction
     from hapticdb.extraction.verdict import disassembly_line, extraction_line
     from hapticdb.poses import write_poses
 
     is_one = isinstance(found, Extraction)
     files = output.files(None if is_one else len(steps)) if steps else []
     for file, (step, _) in zip(files, steps, strict=False):
-        assert step.way is not None  # noqa: S101 - it was found
-        write_poses(file, step.way.poses)
+        assert step.path is not None  # noqa: S101 - it was found
+        write_poses(file, step.path.poses)
     line = extraction_line(found) if isinstance(found, Extraction) else disassembly_line(found)
     shown = partial(_show if is_one else _show_order, found)  # type: ignore[arg-type]
     names = " ... ".join(dict.fromkeys([*files[:1], *files[-1:]]))
@@ -179,15 +183,15 @@ def _report(
     if output.animation is not None and steps:
         from hapticdb.page.animation import animate
 
-        ways = [step for step, _ in steps]
-        animate(output.animation, env, ways, exclude=steps[-1][1], up=output.up)
+        paths = [step for step, _ in steps]
+        animate(output.animation, env, paths, exclude=steps[-1][1], up=output.up)
 
 
 def _show(found: "Extraction") -> list[tuple[str, str]]:
     """Print the blockers; returns the figures of the search."""
-    from hapticdb.exact.report import names_of
+    from hapticdb.exact.sweep_report import names_of
 
-    if found.way is None:
+    if found.path is None:
         rows = (
             (one.object.id, one.object.name, f"{one.pulls} of {found.pulls}")
             for one in found.blockers[:MOST_BLOCKERS]
@@ -205,7 +209,7 @@ def _show(found: "Extraction") -> list[tuple[str, str]]:
 
 
 def _show_order(found: "Disassembly") -> list[tuple[str, str]]:
-    from hapticdb.exact.report import names_of
+    from hapticdb.exact.sweep_report import names_of
     from hapticdb.extraction.verdict import extraction_line, failed_line
 
     for n, step in enumerate(found.steps):

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 import hapticdb
-from hapticdb.cli import render, session_page
-from hapticdb.cli.choosing import FilterOptions
+from hapticdb.cli import render, session_report
+from hapticdb.cli.device_options import HandOptions
 from hapticdb.cli.emit import Output
-from hapticdb.cli.hands import HandOptions
 from hapticdb.cli.options import FramesOn, LawName, RenderingName
 from hapticdb.cli.root import ended_by_signals, exit_by
-from hapticdb.cli.tools import ToolOptions
+from hapticdb.cli.selection import FilterOptions
+from hapticdb.cli.tool_options import ToolOptions
 from hapticdb.cli.values import MIB, refuse
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from hapticdb.session.report import Report
     from hapticdb.session.session import Session
 
-LOOK_EVERY, OBJECTS_EVERY = 0.1, 3
+POLL_EVERY, OBJECTS_EVERY = 0.1, 3
 """Seconds between two polls of the session, the delay of the notes on a lost database or an ended
 recording; and polls between two checks for a tool inside an object: it may be there briefly."""
 CONTACT_STIFFNESS = 1000.0
@@ -100,7 +100,7 @@ def feel(
     tool: ToolOptions,
     hand: HandOptions,
     loop: LoopOptions,
-    felt: FilterOptions,
+    selection: FilterOptions,
     force: ForceOptions,
     recorded: RecordOptions,
     budget: int = 256 * MIB,
@@ -119,24 +119,24 @@ def feel(
     if hand.device == "random" and tool.tool.lower().endswith(".npz"):
         tool = replace(tool, seed=None)  # it is the hand's
     with hapticdb.open(url, read_only=True) as env:  # before a process starts
-        found = felt.felt(env)
-        shell = tool.made(env, law, found.left_out).shell
-    session_page.tell_cost(len(shell), loop.rate, law, loop.frames_on)
+        found = selection.resolve(env)
+        shell = tool.made(env, law, found.excluded).shell
+    session_report.note_cost(len(shell), loop.rate, law, loop.frames_on)
     doing = "starting" if no_baseline else "measuring an empty loop, then starting"
-    with ExitStack() as held:
+    with ExitStack() as stack:
         with render.bar(doing, ""):
-            cells = held.enter_context(hapticdb.ResidentCells(
+            cells = stack.enter_context(hapticdb.ResidentCells(
                 url, budget_bytes=budget, where=found.where, exclude=found.exclude,
                 distances=None if force.law is None else force.law == "distance",
             ))  # fmt: skip
-            session = held.enter_context(hapticdb.Session(
+            session = stack.enter_context(hapticdb.Session(
                 cells, shell, device, law=chosen, rendering=rendering, coupling=coupling,
                 handle=hapticdb.Handle(scale=hand.scale, clutch=hand.clutch),
                 has_baseline=not no_baseline, **vars(loop), **recording,
             ))  # fmt: skip
-        with ended_by_signals(session.ask_to_end) as signals:
+        with ended_by_signals(session.request_end) as signals:
             report = _waited_for(session, force.stiffness, loop.seconds)
-        page = session_page.SessionPage(report, session.cells, shell, recorded.record, path_speed)
+        page = session_report.SessionPage(report, session.cells, shell, recorded.record, path_speed)
         output.emit(page.record(), partial(page.show, began))
     exit_by(signals, f" after {report.loop.seconds:.3g} s")
     if report.database_lost is not None or report.stale_frames:
@@ -171,14 +171,14 @@ def _waited_for(session: "Session", stiffness: float | None, seconds: float | No
     lowered = getattr(session.coupling, "lowered", None)
     if stiffness is not None and lowered is not None:
         render.note(lowered)
-    report, notes, n_looks = None, session_page.Notes(), 0
+    report, notes, n_queries = None, session_report.Notes(), 0
     with render.bar("feeling; Ctrl-C ends it", "s") as progress:
         while report is None:
-            report = session.wait(LOOK_EVERY)
-            notes.look(session)
-            n_looks += 1
-            if n_looks % OBJECTS_EVERY == 0 or report is not None:
-                notes.look_for_objects(session)
+            report = session.wait(POLL_EVERY)
+            notes.poll(session)
+            n_queries += 1
+            if n_queries % OBJECTS_EVERY == 0 or report is not None:
+                notes.report_objects(session)
             if progress is not None:
                 progress(session.n_frames / session.timing.rate, round(seconds or 0.0))
     return report

@@ -96,7 +96,7 @@ def import_(
     )  # fmt: skip
     started = time.perf_counter()
     reports = _imported(url, files, options)
-    _tell(url, files, reports, time.perf_counter() - started, output)
+    _print_reports(url, files, reports, time.perf_counter() - started, output)
     if any(report.error for report in reports):
         raise typer.Exit(2)
 
@@ -116,7 +116,7 @@ def _imported(url: str, files: Sequence[str], options: "ImportOptions") -> "list
         return import_files(url, files, options, progress)
 
 
-def _tell(
+def _print_reports(
     url: str, files: Sequence[str], reports: "Sequence[FileReport]", elapsed: float, output: Output
 ) -> None:
     """Print the result of each file, and the environment's contents."""
@@ -179,8 +179,8 @@ def _lines(file: str, report: "FileReport") -> list[str]:
             ),
         ):
             line += f"; {count} {words}" if count else ""
-    if report.kept_removed:
-        line += f"; {render.counted(report.kept_removed, 'removed part')} left out"
+    if report.still_removed:
+        line += f"; {render.counted(report.still_removed, 'removed part')} left out"
     lines = [line]
     if report.is_unit_assumed:
         lines.append("its unit is not known: its numbers are taken as metres; --unit gives another")

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import as_named, opened_to_keep
 from hapticdb.cli.emit import Output
+from hapticdb.cli.selection import as_named, opened_to_store
 from hapticdb.errors import AccessError, ObjectNotFoundError, UsageError
 from hapticdb.tabular.schema import OBJECT, record
 from hapticdb.units import length_text, place_text
@@ -51,12 +51,12 @@ def info(url: str, *, calibrate: bool = False, cold: bool = False, output: Outpu
     costs, is_kept = _measured(url, cold=cold) if calibrate else (None, False)
     # the store alone: Environment also loads the code of touches and imports, 0.1 s
     with closing(open_store(url, read_only=True)) as store:
-        told, words = _overview(store)
+        values, words = _overview(store)
     if costs is not None:
         known = costs.figures()
         figures = {name: known[name] for name in (*MEANINGS, *RATIOS)}
-        told["costs"] = {"figures": figures, "spread": costs.spread, "is_kept": is_kept}
-    output.emit(told, partial(_show, words, costs))
+        values["costs"] = {"figures": figures, "spread": costs.spread, "is_kept": is_kept}
+    output.emit(values, partial(_show, words, costs))
 
 
 def _overview(store: "Store") -> tuple[dict[str, Any], list[tuple[str, str]]]:
@@ -71,7 +71,7 @@ def _overview(store: "Store") -> tuple[dict[str, Any], list[tuple[str, str]]]:
     fresh = store.freshness(DEFAULT_RESOLUTION)
     source = QuantileVector.of(store, DEFAULT_RESOLUTION).source
     lag = store.lag() if isinstance(store, MayLag) else None
-    told = record(store, "name engine layout") | {
+    values = record(store, "name engine layout") | {
         **record(grid, "voxel_size bits origin curve"),
         "objects": len(objects), "scene": render.box_record(scene), "voxels": voxels,
         **record(size, "rows bytes"), "distances": {"objects": n_banded},
@@ -104,7 +104,7 @@ def _overview(store: "Store") -> tuple[dict[str, Any], list[tuple[str, str]]]:
     if lag is not None:
         old = "none yet" if lag.seconds is None else f"{lag.seconds:.3g} s old"
         words.insert(3, ("standby", f"replayed to {lag.replayed}, the last commit there: {old}"))
-    return told, words
+    return values, words
 
 
 def objects(
@@ -163,7 +163,7 @@ def size_text(obj: "Object") -> str:
 
 def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
     """Costs measured now, and whether they are stored; renews the statistics if permitted."""
-    with opened_to_keep(url) as env:
+    with opened_to_store(url) as env:
         is_kept = not env.store.is_read_only
         if is_kept:
             with suppress(AccessError):  # a role may keep costs only

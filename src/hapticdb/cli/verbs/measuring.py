@@ -4,8 +4,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import as_named
 from hapticdb.cli.emit import Output
+from hapticdb.cli.selection import as_named
 from hapticdb.units import length_text, place_text
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ def demo(
     import numpy as np
 
     from hapticdb.demo import answers, compare, prepare
-    from hapticdb.pictures.demo import draw
+    from hapticdb.pictures.demo_picture import draw
 
     render.note(f"writing the sample into {folder}, importing it ...")
     with render.import_bar() as progress:
@@ -78,12 +78,12 @@ def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> 
 
     base = measured.median_us(YARDSTICK)
     rows = []
-    for name, queries in measured.felt.items():
+    for name, queries in measured.queries.items():
         _, statements, ranges, n_rows, elapsed = zip(*queries, strict=True)
         median, p99 = np.percentile(elapsed, [50, 99])
-        counts = (f"{np.mean(asked):.0f}" for asked in (statements, ranges, n_rows))
+        counts = (f"{np.mean(counts):.0f}" for counts in (statements, ranges, n_rows))
         rows.append((name, f"{median:.0f}", f"{p99:.0f}", *counts, f"{base / median:.1f}"))
-    keys = np.median([query.ranges for query in measured.felt[YARDSTICK]])
+    keys = np.median([query.ranges for query in measured.queries[YARDSTICK]])
     one = measured.imported
     render.say(
         f"\n{one.engine}, {one.layout} layout, {render.counted(one.rows, 'row')}; "
@@ -92,5 +92,5 @@ def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> 
     )
     columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")
     render.table(columns, rows)
-    used = Counter(query.strategy for query in measured.felt["auto"])
+    used = Counter(query.strategy for query in measured.queries["auto"])
     render.say(f"auto chose {render.shares(used)}")

@@ -191,7 +191,7 @@ def _run(
         raise UsageError(f"--seconds {seconds:g}: give a time above 0")
     served.check(serving)
     prepare(served.PAGE, with_kernels=False)  # loads while this process loads the server
-    from hapticdb.server import logs, running
+    from hapticdb.server import lifecycle, logs
 
     if not served.is_near(serving.host) and serving.certificate is None:
         render.note(
@@ -211,7 +211,7 @@ def _run(
                 loop.call_later(seconds, stop.set)
 
         with ended_by_signals(lambda: loop.call_soon_threadsafe(stop.set)) as signals:
-            await running.run(serving, begun, stop)
+            await lifecycle.run(serving, begun, stop)
         return signals
 
     level = logging.WARNING if is_quiet else logging.INFO

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import FilterOptions, ids_of
 from hapticdb.cli.emit import TableOutput, open_csv
 from hapticdb.cli.options import UnitName
-from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
-from hapticdb.cli.tools import tool_of, warn_of_size
+from hapticdb.cli.selection import FilterOptions, ids_of
+from hapticdb.cli.sweep_lists import ListedSweep, naming, read_sweeps
+from hapticdb.cli.tool_options import tool_of, warn_of_size
 from hapticdb.cli.values import Point, pose_of, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import plain
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.cli.choosing import Felt
+    from hapticdb.cli.selection import FilterWords
     from hapticdb.environment import Environment
     from hapticdb.exact.swept import Swept
     from hapticdb.pointshell.shell import PointShell
@@ -87,13 +87,13 @@ class MachineOptions:
 class _Job(NamedTuple):
     """Sweep with resolved objects and its poses; parts : ids of the moving objects."""
 
-    asked: Asked
+    request: ListedSweep
     poses: "NDArray[np.float64]"
     parts: list[int]
-    felt: "Felt"
+    selection: "FilterWords"
 
 
-class _Told(NamedTuple):
+class _Findings(NamedTuple):
     """Result of a sweep with its tool; seconds : of the sweep and of making the tool."""
 
     job: _Job
@@ -110,7 +110,7 @@ def sweep(
     path: str | None = None,
     batch: str | None = None,
     machine: MachineOptions,
-    felt: FilterOptions,
+    selection: FilterOptions,
     contact: float = 5e-5,
     motion: SweepOptions,
     output: TableOutput,
@@ -119,33 +119,33 @@ def sweep(
     import hapticdb
     from hapticdb.exact.swept import SWEPT_KEYS
 
-    where, exclude = felt.where or [], felt.exclude or []
-    one = Asked(tool, part or [], path or "", where, exclude, contact, "")
+    where, exclude = selection.where or [], selection.exclude or []
+    one = ListedSweep(tool, part or [], path or "", where, exclude, contact, "")
     if machine != MachineOptions():
         one = _checked_machine(one, machine, motion, batch)
     else:
         _check(one, motion.tool_unit, batch, output.csv)
-    asked = [one] if batch is None else read_sweeps(batch, one)
+    requests = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(output.csv, SWEPT_KEYS) as table, hapticdb.open(url, read_only=True) as env:
         if machine.machine is None:
-            jobs = [_job(env, each, motion.path_unit) for each in asked]
-            told = _all_told((_swept(env, job, motion) for job in jobs), output)
+            jobs = [_job(env, each, motion.path_unit) for each in requests]
+            findings = _all_told((_swept(env, job, motion) for job in jobs), output)
         else:
-            told = _all_told([_machine_swept(env, one, machine, motion)], output)
+            findings = _all_told([_machine_swept(env, one, machine, motion)], output)
         if table:
-            table.add(*told[0].found.records())
+            table.add(*findings[0].found.records())
         if batch is None and output.has_words:
-            _show(told[0])
+            _show(findings[0])
         elif output.has_words:
-            _show_batch(told)
-    codes = {one.found.verdict.exit_status for one in told}
+            _show_batch(findings)
+    codes = {one.found.verdict.exit_status for one in findings}
     raise typer.Exit(next(code for code in WORST if code in codes))
 
 
 sweep.__doc__ = HELP
 
 
-def _check(one: Asked, tool_unit: str | None, batch: str | None, csv: str | None) -> None:
+def _check(one: ListedSweep, tool_unit: str | None, batch: str | None, csv: str | None) -> None:
     """UsageError for contradictory options."""
     if batch is not None:
         given = {"--tool": one.tool, "--part": one.part, "--path": one.path, "--csv": csv}
@@ -164,8 +164,8 @@ def _check(one: Asked, tool_unit: str | None, batch: str | None, csv: str | None
 
 
 def _checked_machine(
-    one: Asked, machine: MachineOptions, motion: SweepOptions, batch: str | None
-) -> Asked:
+    one: ListedSweep, machine: MachineOptions, motion: SweepOptions, batch: str | None
+) -> ListedSweep:
     """Request for a sweep of a machine; UsageError for contradictory options."""
     if machine.machine is None or machine.joints is None:
         raise UsageError("give --machine, a URDF or MJCF file, and --joints, its path")
@@ -177,102 +177,104 @@ def _checked_machine(
     return one._replace(tool=machine.machine, path=machine.joints)
 
 
-def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
+def _job(env: "Environment", request: ListedSweep, path_unit: str | None) -> _Job:
     from hapticdb.poses import read_poses
 
-    with naming(asked.line):
-        poses = read_poses(asked.path, unit=path_unit or "m")
-        parts = ids_of(env, asked.part, "--part")
-        return _Job(asked, poses, parts, FilterOptions(asked.where, asked.exclude).felt(env, parts))
+    with naming(request.line):
+        poses = read_poses(request.path, unit=path_unit or "m")
+        parts = ids_of(env, request.part, "--part")
+        return _Job(
+            request, poses, parts, FilterOptions(request.where, request.exclude).resolve(env, parts)
+        )
 
 
-def _all_told(sweeps: Iterable[_Told], output: TableOutput) -> list[_Told]:
+def _all_told(sweeps: Iterable[_Findings], output: TableOutput) -> list[_Findings]:
     """Run sweeps; JSON of each is printed at once."""
-    from hapticdb.exact.report import verdict_line
+    from hapticdb.exact.sweep_report import verdict_line
 
-    told = []
+    findings = []
     for one in sweeps:
-        told.append(one)
+        findings.append(one)
         if output.json:
-            asked, line = one.job.asked, verdict_line(one.found, one.shell)
-            about = {"moved": asked.name, "path": asked.path, "line": line}
-            left = {"parts": one.job.parts, "excluded": one.job.felt.left_out}
+            request, line = one.job.request, verdict_line(one.found, one.shell)
+            about = {"moved": request.name, "path": request.path, "line": line}
+            left = {"parts": one.job.parts, "excluded": one.job.selection.excluded}
             render.say_json(about | plain(one.found) | left)
-    return told
+    return findings
 
 
 def _machine_swept(
-    env: "Environment", asked: Asked, given: MachineOptions, motion: SweepOptions
-) -> _Told:
+    env: "Environment", request: ListedSweep, given: MachineOptions, motion: SweepOptions
+) -> _Findings:
     """Read a machine, and sweep it along its joint path."""
     from hapticdb.machines.joint_path import read_joints
+    from hapticdb.machines.machine_sweep import sweep_machine
     from hapticdb.machines.reader import read_machine
-    from hapticdb.machines.sweep import sweep_machine
 
     began = perf_counter()
-    felt = FilterOptions(asked.where, asked.exclude).felt(env)
+    selection = FilterOptions(request.where, request.exclude).resolve(env)
     with render.bar("reading the machine", "files"):
         machine = read_machine(given.machine or "", given.srdf)
-    q = read_joints(asked.path, machine)
+    q = read_joints(request.path, machine)
     with render.bar("sweeping", "objects") as progress:
         found = sweep_machine(
             env, machine, q, at=None if given.at is None else pose_of(given.at, "--at"),
-            where=felt.where, exclude=felt.exclude, contact=asked.contact,
+            where=selection.where, exclude=selection.exclude, contact=request.contact,
             overlap=motion.overlap, seconds=motion.seconds, until_hit=motion.until_hit,
             progress=progress,
         )  # fmt: skip
     for note in found.notes:
         render.note(note)
-    return _Told(_Job(asked, q, [], felt), None, found, perf_counter() - began)
+    return _Findings(_Job(request, q, [], selection), None, found, perf_counter() - began)
 
 
-def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Told:
+def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Findings:
     """Make the tool, and sweep it along the path."""
     from hapticdb.exact.sweep import sweep as sweep_path
 
-    asked, felt = job.asked, job.felt
+    request, selection = job.request, job.selection
     began = perf_counter()
-    with naming(asked.line):
-        if asked.tool is None:
+    with naming(request.line):
+        if request.tool is None:
             with render.bar("sampling the parts", "points"):
                 shell = env.shell(*job.parts, points=1, inset=0.0)
         else:
-            is_saved = asked.tool.lower().endswith(".npz")
+            is_saved = request.tool.lower().endswith(".npz")
             points = None if is_saved else 1
-            tool = tool_of(asked.tool, motion.tool_unit, points, None, has_surface=True)
-            warn_of_size(env, tool, felt.left_out)
+            tool = tool_of(request.tool, motion.tool_unit, points, None, has_surface=True)
+            warn_of_size(env, tool, selection.excluded)
             shell = tool.shell
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
-                env, shell, job.poses, where=felt.where, exclude=felt.exclude,
-                contact=asked.contact, overlap=motion.overlap, seated=asked.tool is None,
+                env, shell, job.poses, where=selection.where, exclude=selection.exclude,
+                contact=request.contact, overlap=motion.overlap, seated=request.tool is None,
                 about=motion.about, seconds=motion.seconds, until_hit=motion.until_hit,
                 progress=progress,
             )  # fmt: skip
     if env.store.revision() != found.revision:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
-    return _Told(job, shell, found, perf_counter() - began)
+    return _Findings(job, shell, found, perf_counter() - began)
 
 
-def _show_batch(told: Sequence[_Told]) -> None:
+def _show_batch(findings: Sequence[_Findings]) -> None:
     """Print a row for each sweep."""
-    from hapticdb.exact.report import gap_text, percent
+    from hapticdb.exact.sweep_report import gap_text, percent
 
     rows = []
-    for job, _, found, _ in told:
+    for job, _, found, _ in findings:
         place = found.hits[0] if found.hits else found.gap.place
         name, at = ("", "") if place is None else (place.object.name, percent(place.fraction))
         gap = gap_text(found) if found.is_free else "-"
-        rows.append((job.asked.name, job.asked.path, found.verdict, gap, name, at))
+        rows.append((job.request.name, job.request.path, found.verdict, gap, name, at))
     render.table(("part or tool", "path", "verdict", "gap>", "nearest or hit", "at>"), rows)
 
 
-def _show(told: _Told) -> None:
+def _show(findings: _Findings) -> None:
     """Print the verdict, a table of hits and contacts, and the figures behind the verdict."""
-    from hapticdb.exact.report import gap_text, name_of, percent, until_text, verdict_line
+    from hapticdb.exact.sweep_report import gap_text, name_of, percent, until_text, verdict_line
 
-    found = told.found
-    render.say(verdict_line(found, told.shell), found.verdict.exit_status)
+    found = findings.found
+    render.say(verdict_line(found, findings.shell), found.verdict.exit_status)
     rows = [
         (place.object.id, name_of(place), "hit", f"at {percent(place.fraction)}", "", "")
         for place in found.hits
@@ -291,13 +293,16 @@ def _show(told: _Told) -> None:
     if rows:
         columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
         render.table(columns, rows, len(rows))
-    poses = render.counted(len(found.path.ways), "pose" if told.shell else "row")
+    poses = render.counted(len(found.path.parameters), "pose" if findings.shell else "row")
     facts = [("path", f"{poses}, {length_text(found.path.length)}")]
     if found.is_free:
         facts.append(("gap", _gap_range(found, gap_text(found))))
-    near, looks = render.counted(found.objects, "object"), render.counted(found.looks, "look")
-    looked = f"{near} near the path, {looks}"
-    facts += [("looked at", looked), ("took", f"{told.seconds:.2f} s")]
+    near, checks = (
+        render.counted(found.objects, "object"),
+        render.counted(found.queries, "proximity check"),
+    )
+    searched = f"{near} near the path, {checks}"
+    facts += [("looked at", searched), ("took", f"{findings.seconds:.2f} s")]
     render.facts(facts)
 
 

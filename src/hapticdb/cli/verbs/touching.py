@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import FilterOptions
 from hapticdb.cli.emit import STDOUT, TableOutput, open_csv
 from hapticdb.cli.options import LawName, StrategyName, UnitName
-from hapticdb.cli.tools import ToolOptions, shell_record, shell_text
+from hapticdb.cli.selection import FilterOptions
+from hapticdb.cli.tool_options import ToolOptions, shell_record, shell_text
 from hapticdb.cli.values import refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import record
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.batches.result import TouchBatch
+    from hapticdb.batches.batch_results import TouchBatch
     from hapticdb.environment import Environment
     from hapticdb.paper.strategies import Strategy
     from hapticdb.pointshell.shell import PointShell
@@ -72,7 +72,7 @@ def touch(
     poses: str,
     path_unit: UnitName | None = None,
     query: QueryOptions,
-    felt: FilterOptions,
+    selection: FilterOptions,
     law: LawName | None = None,
     stiffness: float = 1000.0,
     output: _Output,
@@ -101,8 +101,8 @@ def touch(
         hapticdb.open(url, read_only=True) as env,
     ):
         name = law or ("distance" if env.has_distances else "plane")
-        chosen, found = law_named(name, stiffness), felt.felt(env)
-        shell = tool.made(env, name, found.left_out).shell
+        chosen, found = law_named(name, stiffness), selection.resolve(env)
+        shell = tool.made(env, name, found.excluded).shell
         which: dict[str, Any] = {"where": found.where, "exclude": found.exclude, "law": chosen}
         if output.out is not None:
             pieces = env.touch_pieces(shell, path, on=output.on, **which)
@@ -115,8 +115,8 @@ def touch(
             touched = touch_at(pose)
             summary.add(touched)
             if table or output.json:
-                told = {"pose": index, "law": name} | _record(touched)
-                output.add(table, told | {"shell": shell_record(shell)})
+                values = {"pose": index, "law": name} | _record(touched)
+                output.add(table, values | {"shell": shell_record(shell)})
             if contacts:
                 contacts.add(*_contacts(index, touched, shell, pose))
     if output.has_words and output.contacts_csv != STDOUT:
@@ -131,10 +131,10 @@ def _touch_into(
 
     first = n_touching = 0
     with open_table(out, "--out") as write, closing(pieces):
-        for felt in pieces:
-            write(felt.columns(first))
-            first += len(felt)
-            n_touching += int(np.count_nonzero(felt.n_contacts))
+        for batch in pieces:
+            write(batch.columns(first))
+            first += len(batch)
+            n_touching += int(np.count_nonzero(batch.n_contacts))
     render.facts([
         ("shell", shell_text(shell)),
         ("poses", f"{first:,}: {n_touching:,} in contact"),
@@ -195,8 +195,8 @@ class _Summary:
         import numpy as np
 
         force, torque = (float(np.linalg.norm(one)) for one in (touched.force, touched.torque))
-        strategy, *asked = touched.query
-        self.frames.append((force, torque, len(touched.hits), len(touched.contacts), *asked))
+        strategy, *counts = touched.query
+        self.frames.append((force, torque, len(touched.hits), len(touched.contacts), *counts))
         self.strategies[strategy] += 1
         self.frames_of.update(obj.id for obj in touched.objects)
         self.objects |= {obj.id: obj for obj in touched.objects}
@@ -209,14 +209,14 @@ class _Summary:
         peak, twist = int(np.argmax(forces)), int(np.argmax(torques))
         median, p99 = np.percentile(elapsed, [50, 99])
         n_hit, n_contact = np.count_nonzero(hits), np.count_nonzero(contacts)
-        asked = (_mean_of(statements, "statement"), _mean_of(ranges, "range"))
+        counts = (_mean_of(statements, "statement"), _mean_of(ranges, "range"))
         render.facts([
             ("shell", shell_text(shell)),
             ("frames", f"{len(hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
             ("peak force", f"{forces[peak]:.4g} N at pose {peak}"),
             ("peak torque", f"{torques[twist]:.4g} N m at pose {twist}"),
             ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
-            ("a frame asks", f"{', '.join(asked)}, reads {_mean_of(rows, 'row')}"),
+            ("queries a frame", f"{', '.join(counts)}, reads {_mean_of(rows, 'row')}"),
             ("law", law),
             ("strategy", render.shares(self.strategies)),
             ("objects", f"{len(self.objects)} touched"),

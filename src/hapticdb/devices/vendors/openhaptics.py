@@ -67,7 +67,7 @@ class OpenHapticsDevice:
         hd = load("pyOpenHaptics.hd", "openhaptics")
         callbacks = load("pyOpenHaptics.hd_callback", "openhaptics")
         # the package prints its progress and its errors to standard output
-        with contextlib.redirect_stdout(io.StringIO()) as told:
+        with contextlib.redirect_stdout(io.StringIO()) as output:
             device = hd.init_device(self.name)
             if device is None or device == INVALID_HANDLE:
                 raise DeviceError(f"no OpenHaptics device named {self.name!r}; is it plugged in?")
@@ -76,7 +76,9 @@ class OpenHapticsDevice:
             if _has_failed(hd):
                 hd.stop_scheduler()
                 hd.close_device(device)
-                raise DeviceError(f"OpenHaptics failed to start: {told.getvalue().strip()[-200:]}")
+                raise DeviceError(
+                    f"OpenHaptics failed to start: {output.getvalue().strip()[-200:]}"
+                )
         self._hd, self._id, self._seen = hd, device, None
         window = VelocityWindow()
         # the reference keeps the callback alive: OpenHaptics calls it while the scheduler runs

@@ -67,17 +67,17 @@ CODES = _codes()
 
 
 @leaf
-def _put_bits(out, at, held, n_held, value, n):
-    """Append the n bits of value to the bit buffer `held`; 32 of them move to out[at ...]."""
-    held |= value << n_held
-    n_held += n
-    if n_held >= np.uint64(32):
+def _put_bits(out, at, buffer, n_buffered, value, n):
+    """Append the n bits of value to the bit buffer `buffer`; 32 of them move to out[at ...]."""
+    buffer |= value << n_buffered
+    n_buffered += n
+    if n_buffered >= np.uint64(32):
         for _ in range(4):
-            out[at] = held & np.uint64(255)
-            held >>= np.uint64(8)
+            out[at] = buffer & np.uint64(255)
+            buffer >>= np.uint64(8)
             at += ONE
-        n_held -= np.uint64(32)
-    return at, held, n_held
+        n_buffered -= np.uint64(32)
+    return at, buffer, n_buffered
 
 
 @leaf
@@ -116,27 +116,29 @@ def _set_masks(residuals, masks):
 
 
 @leaf
-def _put_mask(out, at, held, n_held, mask, back, up):
+def _put_mask(out, at, buffer, n_buffered, mask, back, up):
     """Append a line's mask, given those of the plane before and of the line before."""
     if mask == back:
-        return _put_bits(out, at, held, n_held, NONE, ONE)
+        return _put_bits(out, at, buffer, n_buffered, NONE, ONE)
     if back == up:
-        return _put_bits(out, at, held, n_held, (mask << ONE) | ONE, np.uint64(11))
+        return _put_bits(out, at, buffer, n_buffered, (mask << ONE) | ONE, np.uint64(11))
     if mask == up:
-        return _put_bits(out, at, held, n_held, ONE, np.uint64(2))
-    return _put_bits(out, at, held, n_held, (mask << np.uint64(2)) | np.uint64(3), np.uint64(12))
+        return _put_bits(out, at, buffer, n_buffered, ONE, np.uint64(2))
+    return _put_bits(
+        out, at, buffer, n_buffered, (mask << np.uint64(2)) | np.uint64(3), np.uint64(12)
+    )
 
 
 @leaf
-def _put_residuals(out, at, held, n_held, residuals, line, mask):
+def _put_residuals(out, at, buffer, n_buffered, residuals, line, mask):
     """Append the nonzero residuals of a line."""
     first = np.uint64(_place_padded(line))
     while mask:
         residual = residuals[first + np.uint64(lowest_bit(np.int64(mask)))]
         mask &= mask - ONE
         code, n = CODES[0, residual], CODES[1, residual]
-        at, held, n_held = _put_bits(out, at, held, n_held, code, n)
-    return at, held, n_held
+        at, buffer, n_buffered = _put_bits(out, at, buffer, n_buffered, code, n)
+    return at, buffer, n_buffered
 
 
 @leaf
@@ -151,22 +153,24 @@ def _is_like_before(masks, first):
 @leaf
 def _pack_row(masks, residuals, out, at):
     """Write the packed bytes of a row to out from `at` on; return where they end."""
-    held = n_held = NONE
+    buffer = n_buffered = NONE
     for first in range(0, LINES, ROW_SIDE):
         is_same = _is_like_before(masks, first)
-        at, held, n_held = _put_bits(out, at, held, n_held, np.uint64(is_same), ONE)
+        at, buffer, n_buffered = _put_bits(out, at, buffer, n_buffered, np.uint64(is_same), ONE)
         up = NONE
         for line in range(first, first + ROW_SIDE):
             mask = masks[line]
             if not is_same:
                 back = masks[line - ROW_SIDE] if first else NONE
-                at, held, n_held = _put_mask(out, at, held, n_held, mask, back, up)
+                at, buffer, n_buffered = _put_mask(out, at, buffer, n_buffered, mask, back, up)
             if mask:
-                at, held, n_held = _put_residuals(out, at, held, n_held, residuals, line, mask)
+                at, buffer, n_buffered = _put_residuals(
+                    out, at, buffer, n_buffered, residuals, line, mask
+                )
             up = mask
-    for _ in range(0, np.int64(n_held), 8):
-        out[at] = held & np.uint64(255)
-        held >>= np.uint64(8)
+    for _ in range(0, np.int64(n_buffered), 8):
+        out[at] = buffer & np.uint64(255)
+        buffer >>= np.uint64(8)
         at += ONE
     return at
 

@@ -73,8 +73,8 @@ def measure_pull(spring, tool, hand, pose, center, follower):
     stiffness = follower.share * spring.stiffness / spring.scale
     turn_stiffness = follower.share * spring.turn_stiffness * spring.scale
     most, most_turn = BEYOND_CAP * spring.cap, BEYOND_CAP * spring.turn_cap * spring.scale
-    way, angle = length_at(pull, 0), length_at(pull, 3)
-    follower.pulls[0] = most / way if stiffness * way > most else stiffness
+    distance, angle = length_at(pull, 0), length_at(pull, 3)
+    follower.pulls[0] = most / distance if stiffness * distance > most else stiffness
     follower.pulls[1] = most_turn / angle if turn_stiffness * angle > most_turn else turn_stiffness
 
 

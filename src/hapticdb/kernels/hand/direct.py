@@ -8,7 +8,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.device_spring import at_device, shortened
-from hapticdb.kernels.hand.holding import is_somewhere, send, set_result
+from hapticdb.kernels.hand.fading import is_valid_pose, send, set_result
 from hapticdb.kernels.rigid import numbers_of, set_numbers
 
 
@@ -23,7 +23,7 @@ def render(terms, center, servo, frame, dt):
     `fade` seconds.
     """
     tool, hand = servo.tool, servo.hand
-    is_lost = hand.is_stale or not is_somewhere(hand)
+    is_lost = hand.is_stale or not is_valid_pose(hand)
     unknown = 0 if is_lost else np.int64(frame.unknown)
     is_held = is_lost or unknown > 0
     if not is_held:

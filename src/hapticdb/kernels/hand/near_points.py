@@ -11,8 +11,8 @@ from collections import namedtuple
 import numpy as np
 
 from hapticdb.kernels._jit import inlined, leaf
+from hapticdb.kernels.field.distance_law import ONSET
 from hapticdb.kernels.field.lattice import HALF_WIDTH
-from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.field.spline import (
     bound_in_free_block,
     lower_bound,
@@ -31,7 +31,7 @@ from hapticdb.kernels.resident.cells import (
     n_runs_of,
     seen_in,
 )
-from hapticdb.kernels.resident.nearest import room_around
+from hapticdb.kernels.resident.nearest_voxels import room_around
 from hapticdb.kernels.rigid import moment, moved, transform_of
 
 MARGIN = 0.5
@@ -71,10 +71,10 @@ return later, and the number of contacts changes less often."""
 
 
 @leaf
-def clamped_into(place, px, py, pz):
+def clamped_into(grid, px, py, pz):
     """Point, m, clamped into the grid, and its offset from there: six numbers, voxels."""
-    size, last = place.size, place.side - 1e-6
-    px, py, pz = (px - place.x) / size, (py - place.y) / size, (pz - place.z) / size
+    size, last = grid.size, grid.side - 1e-6
+    px, py, pz = (px - grid.x) / size, (py - grid.y) / size, (pz - grid.z) / size
     x, y, z = min(max(px, 0.0), last), min(max(py, 0.0), last), min(max(pz, 0.0), last)
     return x, y, z, px - x, py - y, pz - z
 
@@ -85,11 +85,11 @@ def _outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
 
     (dx, dy, dz) : offset from there, voxels. All surfaces are in the grid, so its length adds to u.
     """
-    way = math.sqrt(dx * dx + dy * dy + dz * dz)
-    gx = gx if dx == 0.0 else dx / way
-    gy = gy if dy == 0.0 else dy / way
-    gz = gz if dz == 0.0 else dz / way
-    return u + way, gx, gy, gz, max(bound, way)
+    path_length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    gx = gx if dx == 0.0 else dx / path_length
+    gy = gy if dy == 0.0 else dy / path_length
+    gz = gz if dz == 0.0 else dz / path_length
+    return u + path_length, gx, gy, gz, max(bound, path_length)
 
 
 @inlined
@@ -173,14 +173,14 @@ def along_and_about(lever, x, y, z):
 
 
 @leaf
-def bends_at(payload, slot, at, lever, looked):
+def bends_at(payload, slot, at, lever, sample):
     """Two curvatures at a near point, and `along_and_about` of both directions.
 
-    at : from `clamped_into`; lever (3), m; looked : from `distance_at` there.
+    at : from `clamped_into`; lever (3), m; sample : from `distance_at` there.
     """
     xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, at[0], at[1], at[2])
     c, vx, vy, vz, d, wx, wy, wz = _bends_of(
-        looked[1], looked[2], looked[3], xx, yy, zz, xy, xz, yz
+        sample[1], sample[2], sample[3], xx, yy, zz, xy, xz, yz
     )
     return c, d, along_and_about(lever, vx, vy, vz), along_and_about(lever, wx, wy, wz)
 
@@ -208,22 +208,22 @@ def _goes_nearer(u, bound, before):
     return (u < FLOOR and u <= before.u) or (bound < LEAST_BOUND and bound <= before.bound)
 
 
-Grasp = namedtuple(  # noqa: PYI024 - its types are those of the cells that a kernel reads
-    "Grasp", "cells which shell place follower kept near bends met missed"
+ProximityQuery = namedtuple(  # noqa: PYI024 - its types are those of the cells that a kernel reads
+    "ProximityQuery", "cells which shell grid follower kept near bends contacts missed"
 )
 """Arguments of a tool's proximity queries: input, state and output.
 
-cells : `Cells` with distances; which : the frame's directory; shell : `Clusters`; place : the
+cells : `Cells` with distances; which : the frame's directory; shell : `Clusters`; grid : the
 grid; follower : record of FOLLOWER; kept (N,) of POINT; near (2, N) of NEAR, bends (2, N) of
 BENDS : near points of two poses, in the order of the points, row `follower.side` for the tool's
-pose; met (N,) int64 : points in contact; missed : a MISSED, the unknown cells.
+pose; contacts (N,) int64 : points in contact; missed : a MISSED, the unknown cells.
 """
 
 
 @leaf
-def _look_at_run(grasp, run, transform, center):
-    """Evaluate the due points of run number `run` -> OPEN, SHUT or MANY, as in `look`."""
-    cells, which, shell, place, follower, kept, _, _, _, missed = grasp
+def _query_run(query, run, transform, center):
+    """Evaluate the due points of run number `run` -> OPEN, SHUT or MANY, as below."""
+    cells, which, shell, grid, follower, kept, _, _, _, missed = query
     seen, points = seen_in(cells, which, cells.words), shell.points
     start, end = run * shell.run, min((run + 1) * shell.run, points.shape[0])
     payload, (cx, cy, cz), half = cells.payload, center, 1 - follower.side
@@ -237,7 +237,7 @@ def _look_at_run(grasp, run, transform, center):
             run_due = min(run_due, point.due)
             continue
         px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
-        at = clamped_into(place, px, py, pz)
+        at = clamped_into(grid, px, py, pz)
         key = cell_key(np.int64(at[0]), np.int64(at[1]), np.int64(at[2]))
         if key != last_key:
             last_key = key
@@ -252,25 +252,25 @@ def _look_at_run(grasp, run, transform, center):
                 point.due = travelled + bound - FAR
                 run_due = min(run_due, point.due)
                 continue
-        looked = distance_at(payload, slot, mask, at)
-        u, bound = looked[0], looked[4]
+        sample = distance_at(payload, slot, mask, at)
+        u, bound = sample[0], sample[4]
         point.due = travelled + bound - FAR
         run_due = min(run_due, point.due)
         if u >= ONSET + MARGIN and bound >= LEAST_BOUND:
             continue
-        if follower.is_walking and _goes_nearer(u, bound, point):
+        if follower.is_advancing and _goes_nearer(u, bound, point):
             return SHUT
         if 0 < most_near <= n_near and merged < MOST_MERGED:
             return MANY
         lever = px - cx, py - cy, pz - cz
-        near = grasp.near[half, n_near]
+        near = query.near[half, n_near]
         near.point, near.u, near.bound, near.is_hollow = n, u, bound, False
-        both = along_and_about(lever, looked[1], looked[2], looked[3])
+        both = along_and_about(lever, sample[1], sample[2], sample[3])
         for axis in range(3):
             near.along[axis], near.about[axis] = both[axis], both[3 + axis]
         if follower.is_bent and may_be_hollow(mask, at, u):
-            bends = grasp.bends[half, n_near]
-            near.is_hollow = _write_bends(bends, bends_at(payload, slot, at, lever, looked))
+            bends = query.bends[half, n_near]
+            near.is_hollow = _write_bends(bends, bends_at(payload, slot, at, lever, sample))
         n_near += 1
     kept[run].run_due = run_due
     follower.n_tried, missed.n_cells = n_near, n_missed
@@ -278,63 +278,63 @@ def _look_at_run(grasp, run, transform, center):
 
 
 @leaf
-def rest_of_sphere(seen, spheres, run, transform, place):
+def rest_of_sphere(seen, spheres, run, transform, grid):
     """Voxels a run's sphere may travel before a point in it can be near; at most 0 if one may."""
-    x, y, z = in_voxels(transform, place, spheres[run, 0], spheres[run, 1], spheres[run, 2])
-    return room_around(seen, x, y, z, spheres[run, 3] / place.size + FAR, LONGEST_REST, place.side)
+    x, y, z = in_voxels(transform, grid, spheres[run, 0], spheres[run, 1], spheres[run, 2])
+    return room_around(seen, x, y, z, spheres[run, 3] / grid.size + FAR, LONGEST_REST, grid.side)
 
 
 @leaf
-def _look_at_due_runs(grasp, transform, center, way):
+def _query_due_runs(query, transform, center, path_length):
     """Evaluate the points of all due runs -> OPEN, SHUT or MANY.
 
-    The sphere of a run already due at the last query, `way` voxels ago, is not tested.
+    The sphere of a run already due at the last query, `path_length` voxels ago, is not tested.
     """
-    cells, which, shell, place, follower, kept, _, _, _, missed = grasp
+    cells, which, shell, grid, follower, kept, _, _, _, missed = query
     travelled = follower.travelled
     follower.n_tried = follower.n_unknown = missed.n_cells = 0
     for run in range(n_runs_of(shell)):
         due = kept[run].run_due
         if travelled < due:
             continue
-        if follower.is_large and (due == -NEVER or due >= travelled - way):
+        if follower.is_large and (due == -NEVER or due >= travelled - path_length):
             rest = rest_of_sphere(
-                seen_in(cells, which, cells.words), shell.spheres, run, transform, place
+                seen_in(cells, which, cells.words), shell.spheres, run, transform, grid
             )
             if rest > 0.0:
                 kept[run].run_due = travelled + rest
                 continue
-        found = _look_at_run(grasp, run, transform, center)
+        found = _query_run(query, run, transform, center)
         if found != OPEN:
             return found
     return OPEN
 
 
 @leaf
-def look(grasp, pose, way, is_walking):
+def query_proximity(query, pose, path_length, is_advancing):
     """Proximity query of the tool at a pose (4, 4) -> OPEN, SHUT or NOT_KNOWN.
 
-    way : path length of the farthest point since the last query, voxels. is_walking : SHUT if a
-    point is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's pose. The
-    near points go into the other row of `near`, not that of the tool's pose; SHUT leaves it
-    incomplete.
+    path_length : path length of the farthest point since the last query, voxels. is_advancing :
+    SHUT if a point is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's
+    pose. The near points go into the other row of `near`, not that of the tool's pose; SHUT leaves
+    it incomplete.
 
-    A GPU may run the query instead (`kernels.gpu.looks`), through `follower.looker`. Its sessions
-    merge contacts: from `merges_from` near points on, one contact represents 2, 4, 8 ... neighbours
-    by index, up to `MOST_MERGED`. Of the others only the bounds are computed, so no point crosses a
-    surface. The CPU merges likewise, as the GPU's test oracle.
+    A GPU may run the query instead (`kernels.gpu.proximity_queries`), through `follower.gpu_query`.
+    Its sessions merge contacts: from `merges_from` near points on, one contact represents 2, 4, 8
+    ... neighbours by index, up to `MOST_MERGED`. Of the others only the bounds are computed, so no
+    point crosses a surface. The CPU merges likewise, as the GPU's test oracle.
     """
-    shell, follower, kept = grasp.shell, grasp.follower, grasp.kept
-    follower.travelled += way
-    follower.is_walking, follower.way = is_walking, way
-    follower.n_looks += 1
+    shell, follower, kept = query.shell, query.follower, query.kept
+    follower.travelled += path_length
+    follower.is_advancing, follower.way = is_advancing, path_length
+    follower.n_queries += 1
     follower.merged = max(follower.merged, 1)
-    if follower.looker != 0:
-        return call(follower.looker)
+    if follower.gpu_query != 0:
+        return call(follower.gpu_query)
     transform = transform_of(pose)
     center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     while True:
-        found = _look_at_due_runs(grasp, transform, center, way)
+        found = _query_due_runs(query, transform, center, path_length)
         if found != MANY:
             break
         follower.merged *= 2
@@ -348,10 +348,10 @@ def look(grasp, pose, way, is_walking):
 
 
 @leaf
-def settle(grasp):
+def settle(query):
     """Accept the tried pose as the tool's: its near points, their distances and onsets."""
-    follower, kept = grasp.follower, grasp.kept
-    before, after = grasp.near[follower.side], grasp.near[1 - follower.side]
+    follower, kept = query.follower, query.kept
+    before, after = query.near[follower.side], query.near[1 - follower.side]
     m = n = 0
     while m < follower.n_near or n < follower.n_tried:  # both in the order of the points
         if n == follower.n_tried or (m < follower.n_near and before[m].point < after[n].point):
@@ -370,36 +370,36 @@ def settle(grasp):
 
 
 @leaf
-def take_more_points(grasp):
+def take_more_points(query):
     """Halve `follower.merged` for the next query, if few contacts are near -> whether it did."""
-    follower, kept = grasp.follower, grasp.kept
+    follower, kept = query.follower, query.kept
     if follower.merged <= 1 or ROOMY * follower.n_near > follower.merges_from:
         return False
     follower.merged //= 2
     follower.anew = max(follower.anew, RUNS_ANEW)
-    if follower.looker == 0:
+    if follower.gpu_query == 0:
         for n in range(kept.shape[0]):
             kept[n].run_due = -NEVER
     return True
 
 
 @leaf
-def look_anew(grasp):
+def query_anew(query):
     """Make every point due at the next query; the near points are unchanged."""
-    follower, kept = grasp.follower, grasp.kept
+    follower, kept = query.follower, query.kept
     follower.travelled = follower.astray = 0.0
     follower.anew = POINTS_ANEW
-    if follower.looker != 0:
+    if follower.gpu_query != 0:
         return
     for n in range(kept.shape[0]):
         kept[n].due = kept[n].run_due = -NEVER
 
 
 @leaf
-def forget(grasp):
+def reset_points(query):
     """Reset all points, as at the start: none is near, and each has the full onset."""
-    look_anew(grasp)
-    follower, kept = grasp.follower, grasp.kept
+    query_anew(query)
+    follower, kept = query.follower, query.kept
     follower.n_near = follower.n_tried = 0
     for n in range(kept.shape[0]):
         kept[n].u = kept[n].bound = HALF_WIDTH
@@ -407,23 +407,23 @@ def forget(grasp):
 
 
 @leaf
-def least_distance(grasp):
+def least_distance(query):
     """Least distance of the near points at the tool's pose, voxels; HALF_WIDTH without any."""
-    near, least = grasp.near[grasp.follower.side], HALF_WIDTH
-    for m in range(grasp.follower.n_near):
+    near, least = query.near[query.follower.side], HALF_WIDTH
+    for m in range(query.follower.n_near):
         least = min(least, near[m].u)
     return least
 
 
 @leaf
-def fix_onsets(grasp):
+def fix_onsets(query):
     """Begin each near point's contact at its present distance, at most at the full onset."""
-    near = grasp.near[grasp.follower.side]
-    for m in range(grasp.follower.n_near):
-        grasp.kept[near[m].point].onset = min(near[m].u, ONSET)
+    near = query.near[query.follower.side]
+    for m in range(query.follower.n_near):
+        query.kept[near[m].point].onset = min(near[m].u, ONSET)
 
 
 @inlined
-def depth_of(grasp, near):
+def depth_of(query, near):
     """Depth of a near point below its onset, m; negative above it."""
-    return grasp.place.size * (grasp.kept[near.point].onset - near.u)
+    return query.grid.size * (query.kept[near.point].onset - near.u)

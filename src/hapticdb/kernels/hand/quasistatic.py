@@ -13,6 +13,14 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import leaf
+from hapticdb.kernels.force_law import NO_WRENCH
+from hapticdb.kernels.hand.advancement import (
+    MOST_QUERIES,
+    advance_step,
+    place_on_step,
+    set_pose,
+    step_bound,
+)
 from hapticdb.kernels.hand.device_spring import (
     BEYOND_CAP,
     STOPPING,
@@ -22,15 +30,16 @@ from hapticdb.kernels.hand.device_spring import (
     measure_pull,
     wrench_of,
 )
-from hapticdb.kernels.hand.holding import (
+from hapticdb.kernels.hand.fading import (
     IS_CUT,
     IS_DROPPED,
     is_finite,
-    is_somewhere,
+    is_valid_pose,
     place_lost,
     send,
     set_result,
 )
+from hapticdb.kernels.hand.gauss_newton import solve_step
 from hapticdb.kernels.hand.near_points import (
     FLOOR,
     NOT_KNOWN,
@@ -38,15 +47,14 @@ from hapticdb.kernels.hand.near_points import (
     SHUT,
     depth_of,
     fix_onsets,
-    forget,
     least_distance,
-    look,
-    look_anew,
+    query_anew,
+    query_proximity,
+    reset_points,
     settle,
     take_more_points,
 )
-from hapticdb.kernels.hand.path import MOST_LOOKS, keep_pose, place_on_way, walk, way_of_step
-from hapticdb.kernels.hand.steadying import (
+from hapticdb.kernels.hand.oscillation_guard import (
     MOST_CHANGE,
     WINDOW,
     begin_steady,
@@ -55,11 +63,9 @@ from hapticdb.kernels.hand.steadying import (
     remember_hand,
     soften_change,
 )
-from hapticdb.kernels.hand.step import solve_step
-from hapticdb.kernels.law import NO_WRENCH
 from hapticdb.kernels.rigid import numbers_of, pose_of_quaternion
 
-IS_LOOSE, IS_SOFTER, IS_SNAPPING, IS_ANEW = 64, 128, 256, 512
+IS_INSIDE, IS_SOFTER, IS_SNAPPING, IS_ANEW = 64, 128, 256, 512
 """Marks of a period, besides those of `holding`: tool inside an obstacle, without contacts;
 stiffness lowered by the guard; change of the force limited; cells changed."""
 
@@ -87,21 +93,21 @@ def has_moved(tool, follower):
     """Whether the tool is not at the pose of its near points."""
     at, count = numbers_of(tool), 0
     for n in range(7):
-        count += at[n] != follower.looked_at[n]
+        count += at[n] != follower.queried_at[n]
     return count > 0
 
 
 @leaf
-def _meet_change(grasp):
+def _meet_change(query):
     """Compare the last query with the one before, at the same pose in older cells.
 
     Contact with an approached surface begins at the present distance, so no force jumps. Returns
     whether a point is now inside an object.
     """
-    near = grasp.near[1 - grasp.follower.side]
+    near = query.near[1 - query.follower.side]
     is_sunk = False
-    for m in range(grasp.follower.n_tried):
-        point, u = grasp.kept[near[m].point], near[m].u
+    for m in range(query.follower.n_tried):
+        point, u = query.kept[near[m].point], near[m].u
         if u < point.u - SUNK:
             point.onset = min(point.onset, u)
             is_sunk = is_sunk or u < FLOOR - SUNK
@@ -109,115 +115,115 @@ def _meet_change(grasp):
 
 
 @leaf
-def _look_here(grasp, tool):
+def _query_here(query, tool):
     """Query the tool's pose, at the start or in new cells; False with points in unknown cells."""
-    follower, is_first = grasp.follower, tool.version == 0
+    follower, is_first = query.follower, tool.version == 0
     if is_first:
-        forget(grasp)
+        reset_points(query)
         begin_steady(follower)
         follower.is_loose = follower.is_braked = follower.is_bent = False
     else:
-        look_anew(grasp)
+        query_anew(query)
     pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
-    found = look(grasp, tool.tried_pose, 0.0, np.bool_(False))
+    found = query_proximity(query, tool.tried_pose, 0.0, np.bool_(False))
     if found == NOT_KNOWN:
         return False
-    is_sunk = not has_moved(tool, follower) and _meet_change(grasp)
-    settle(grasp)
-    keep_pose(tool, follower, numbers_of(tool))
+    is_sunk = not has_moved(tool, follower) and _meet_change(query)
+    settle(query)
+    set_pose(tool, follower, numbers_of(tool))
     if is_first:
-        fix_onsets(grasp)
-        is_sunk = least_distance(grasp) < FLOOR
+        fix_onsets(query)
+        is_sunk = least_distance(query) < FLOOR
     follower.is_loose = follower.is_loose or is_sunk
     return True
 
 
 @leaf
-def _look_at_more(grasp, tool):
+def _query_more(query, tool):
     """Query the tool's pose, with contacts merged before -> OPEN or NOT_KNOWN.
 
     Contact of a returning point begins at its present distance, so no force jumps. A point nearer
     than FLOOR gets no nearer to a surface.
     """
     pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
-    found = look(grasp, tool.tried_pose, grasp.follower.astray, np.bool_(False))
+    found = query_proximity(query, tool.tried_pose, query.follower.astray, np.bool_(False))
     if found == OPEN:
-        _meet_change(grasp)
-        settle(grasp)
+        _meet_change(query)
+        settle(query)
     return found
 
 
 @leaf
-def _follow_loosely(grasp, spring, tool, hand):
+def _follow_inside(query, spring, tool, hand):
     """Move a tool inside an obstacle to the hand -> OPEN or NOT_KNOWN.
 
     Contacts begin once no point is nearer than FLOOR to a surface.
     """
-    follower, center = grasp.follower, grasp.shell.center
+    follower, center = query.follower, query.shell.center
     measure_pull(spring, tool, hand, tool.pose, center, follower)
     for axis in range(6):
         follower.step[axis] = follower.pull[axis]
-    way = way_of_step(follower, spring.radius, grasp.place.size)
-    at = place_on_way(tool, center, follower, 1.0)
-    found = look(grasp, tool.tried_pose, follower.astray + way, np.bool_(False))
-    follower.astray = way
+    path_length = step_bound(follower, spring.radius, query.grid.size)
+    at = place_on_step(tool, center, follower, 1.0)
+    found = query_proximity(query, tool.tried_pose, follower.astray + path_length, np.bool_(False))
+    follower.astray = path_length
     if found == OPEN:
-        settle(grasp)
-        keep_pose(tool, follower, at)
+        settle(query)
+        set_pose(tool, follower, at)
         follower.n_active = 0
-        if least_distance(grasp) >= FLOOR:
+        if least_distance(query) >= FLOOR:
             follower.is_loose = False
-            fix_onsets(grasp)
+            fix_onsets(query)
     return found
 
 
 @leaf
-def follow(grasp, spring, tool, hand):
+def follow(query, spring, tool, hand):
     """Move the tool to the balance of spring and contacts; return the last query's result.
 
     SHUT : the tool is stopped by a surface, or the period has no queries left.
     """
-    follower, size, most = grasp.follower, grasp.place.size, BEYOND_CAP * spring.cap
+    follower, size, most = query.follower, query.grid.size, BEYOND_CAP * spring.cap
     stiffness = contact_stiffness(spring, size)
     found = OPEN
     for n in range(STEPS + 1):
-        measure_pull(spring, tool, hand, tool.pose, grasp.shell.center, follower)
+        measure_pull(spring, tool, hand, tool.pose, query.shell.center, follower)
         brake = STOPPING * most / size if follower.is_braked else 0.0
         turn_brake = brake * spring.radius * spring.radius
-        solve_step(grasp, stiffness, brake, turn_brake, ROUNDS)
-        way = way_of_step(follower, spring.radius, size)
+        solve_step(query, stiffness, brake, turn_brake, ROUNDS)
+        path_length = step_bound(follower, spring.radius, size)
         follower.is_bent = n >= BENT_FROM or follower.n_bends > 0
-        if n == STEPS or follower.n_looks >= MOST_LOOKS or way == 0.0:
+        if n == STEPS or follower.n_queries >= MOST_QUERIES or path_length == 0.0:
             break
-        if way < SETTLED and follower.n_active > 0:
+        if path_length < SETTLED and follower.n_active > 0:
             for axis in range(6):
                 follower.pull[axis] -= follower.step[axis]
             break
-        done, found = walk(grasp, spring.radius, tool)
+        done, found = advance_step(query, spring.radius, tool)
         if found == NOT_KNOWN:
             break
         if done == 1.0 and follower.n_active == 0 and not follower.is_braked:
-            keep_pose(tool, follower, numbers_of(hand))
+            set_pose(tool, follower, numbers_of(hand))
         follower.is_braked = done < SHORT_CUT
     return found
 
 
 @leaf
-def _record_felt(grasp, stiffness, felt):
-    """Contacts at the tool's pose: points into grasp.met, wrench on the tool, counts into `felt`.
+def _record_contacts(query, stiffness, felt):
+    """Write points to query.contacts, and wrench on the tool and counts of contacts to `felt`.
 
     Hits are the near points in the contact set or with a force; contacts are those with a force.
     """
-    follower, near, deepest = grasp.follower, grasp.near[grasp.follower.side], 0.0
+    follower, near, deepest = query.follower, query.near[query.follower.side], 0.0
     n_hits = n_contacts = 0
     set_result(felt, NO_WRENCH, 0, 0, 0, 0.0)
     if not follower.is_loose:
         for m in range(follower.n_near):
             one = near[m]
-            depth = depth_of(grasp, one)
+            depth = depth_of(query, one)
             if depth <= 0.0 and not one.is_active:
                 continue
-            grasp.met[n_hits] = one.point
+            query.contacts[n_hits] = one.point
             n_hits += 1
             if depth > 0.0:
                 n_contacts += 1
@@ -230,12 +236,12 @@ def _record_felt(grasp, stiffness, felt):
 
 
 @leaf
-def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
+def _push_hand(spring, tool, hand, center, follower, is_in_contact, dt, wrench):
     """Wrench on the hand at the device, about the handle's origin, into wrench (6,) -> marks."""
     for axis in range(6):
         wrench[axis] = 0.0
     force = 0.0
-    if is_felt:
+    if is_in_contact:
         wrench[0], wrench[1], wrench[2], wrench[3], wrench[4], wrench[5] = at_device(
             spring, hand, center, *wrench_of(follower, spring.cap, spring.turn_cap * spring.scale)
         )
@@ -252,58 +258,60 @@ def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
     last, at = follower.last_hand, hand.position
     x, y, z = at[0] + rx - last[0], at[1] + ry - last[1], at[2] + rz - last[2]
     last[0], last[1], last[2] = at[0] + rx, at[1] + ry, at[2] + rz
-    way = math.sqrt(x * x + y * y + z * z) / spring.scale
-    allowed = MOST_CHANGE * dt + (spring.stiffness + spring.damping / WINDOW) * way
+    path_length = math.sqrt(x * x + y * y + z * z) / spring.scale
+    allowed = MOST_CHANGE * dt + (spring.stiffness + spring.damping / WINDOW) * path_length
     if soften_change(tool.kept, wrench, allowed):
         flags |= IS_SNAPPING
     return flags
 
 
 @leaf
-def finish(grasp, spring, servo, is_held, found, dt):
+def finish(query, spring, servo, is_held, found, dt):
     """Send the period's wrench and marks; contacts into `tool.felt`."""
     flags, tool, hand, wrench = 0, servo.tool, servo.hand, servo.sent.wrench
-    follower = grasp.follower
+    follower = query.follower
     if is_held:
         follower.n_trail = 0  # a speed across a gap has no meaning
     else:
         remember_hand(follower, hand, dt)
-        is_over = follower.n_looks >= MOST_LOOKS
-        is_felt = follower.n_active > 0 or (found == SHUT and not is_over)
-        is_felt = is_felt and not follower.is_loose
-        flags |= _push_hand(spring, tool, hand, grasp.shell.center, follower, is_felt, dt, wrench)
+        is_over = follower.n_queries >= MOST_QUERIES
+        is_in_contact = follower.n_active > 0 or (found == SHUT and not is_over)
+        is_in_contact = is_in_contact and not follower.is_loose
+        flags |= _push_hand(
+            spring, tool, hand, query.shell.center, follower, is_in_contact, dt, wrench
+        )
         for n in range(6):
             tool.kept[n] = wrench[n] if is_finite(wrench) else 0.0
-        _record_felt(grasp, contact_stiffness(spring, grasp.place.size), tool.felt)
+        _record_contacts(query, contact_stiffness(spring, query.grid.size), tool.felt)
         flags |= IS_DROPPED if is_over else (IS_CUT if found == SHUT else 0)
-        flags |= IS_LOOSE if follower.is_loose else 0
+        flags |= IS_INSIDE if follower.is_loose else 0
     send(spring, servo, is_held, flags, dt)
 
 
 @leaf
-def _move_tool(grasp, version, spring, tool, hand):
+def _move_tool(query, version, spring, tool, hand):
     """Move the tool after the hand, in a version of the cells -> result of the last query."""
     found = OPEN
-    if tool.version != version or has_moved(tool, grasp.follower):
-        if not _look_here(grasp, tool):
+    if tool.version != version or has_moved(tool, query.follower):
+        if not _query_here(query, tool):
             return NOT_KNOWN
         tool.version = version
-    elif take_more_points(grasp):
-        found = _look_at_more(grasp, tool)
+    elif take_more_points(query):
+        found = _query_more(query, tool)
     if found != OPEN:
         return found
-    if grasp.follower.is_loose:
-        return _follow_loosely(grasp, spring, tool, hand)
-    return follow(grasp, spring, tool, hand)
+    if query.follower.is_loose:
+        return _follow_inside(query, spring, tool, hand)
+    return follow(query, spring, tool, hand)
 
 
 @leaf
-def advance(grasp, version, spring, servo, dt):
+def advance(query, version, spring, servo, dt):
     """Move the tool for one period of dt seconds, in a version of the cells.
 
     servo : record of SERVO, with `hand` as input, `tool` and `sent` as output. `follower`, `kept`
     and `near` are the coupling's own from period to period; while `tool.version` is 0, it ignores
-    their contents and starts anew. The caller preserves `grasp.missed` between periods. It may
+    their contents and starts anew. The caller preserves `query.missed` between periods. It may
     reset the tool to an earlier pose, but not these three.
 
     The tool stops before a step into unknown cells. The last wrench is sent for `hold` seconds,
@@ -318,19 +326,19 @@ def advance(grasp, version, spring, servo, dt):
     torque is the moment of this force at the tool's centre, plus that of the rotational spring.
     Without a contact or an obstacle it falls to exactly zero, as fast as `soften_change` allows.
     `tool.felt` has the contacts' wrench on the tool, N and N m of the scene, and their counts.
-    `grasp.met` has `sent.hits` points: the `sent.contacts` with a force, and those about to have
-    one. `sent.deepest` is onset less distance, m.
+    `query.contacts` has `sent.hits` points: the `sent.contacts` with a force, and those about to
+    have one. `sent.deepest` is onset less distance, m.
     """
     dt = max(dt, 0.0)
-    tool, hand, sent, follower = servo.tool, servo.hand, servo.sent, grasp.follower
-    is_hand = is_somewhere(hand)
+    tool, hand, sent, follower = servo.tool, servo.hand, servo.sent, query.follower
+    is_hand = is_valid_pose(hand)
     is_held = hand.is_stale or not is_hand
     place_lost(tool, hand, is_hand)
-    follower.n_looks = 0
+    follower.n_queries = 0
     found = OPEN
     if not is_held:
-        found = _move_tool(grasp, version, spring, tool, hand)
+        found = _move_tool(query, version, spring, tool, hand)
     is_held = is_held or found == NOT_KNOWN
-    finish(grasp, spring, servo, is_held, found, dt)
+    finish(query, spring, servo, is_held, found, dt)
     sent.unknown = follower.n_unknown if found == NOT_KNOWN else 0
-    sent.n_steps = follower.n_looks
+    sent.n_steps = follower.n_queries

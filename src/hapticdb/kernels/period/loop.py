@@ -19,13 +19,13 @@ from numba import config, types
 from numba.np.numpy_support import as_dtype, from_dtype
 
 from hapticdb.kernels._jit import INT, chosen_by_type, entry, leaf, record_of
-from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels.field.distance_law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels.force_law import TANGENT_PLANE
 from hapticdb.kernels.hand.calling import address_of_kernel, call, call_kernel
 from hapticdb.kernels.hand.direct import render
-from hapticdb.kernels.hand.handle import follow_reading
-from hapticdb.kernels.hand.near_points import Grasp
-from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_LOOSE, advance
-from hapticdb.kernels.law import TANGENT_PLANE
+from hapticdb.kernels.hand.handle_motion import follow_reading
+from hapticdb.kernels.hand.near_points import ProximityQuery
+from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_INSIDE, advance
 from hapticdb.kernels.period.clock import now_ns, wait_until
 from hapticdb.kernels.period.following import follow_arrivals
 from hapticdb.kernels.period.memory import (
@@ -50,11 +50,11 @@ from hapticdb.kernels.period.telling import (
 from hapticdb.kernels.records.cells import REQUEST
 from hapticdb.kernels.records.hand import FRAME
 from hapticdb.kernels.records.session import LOOP_CLOCK, SLOT
+from hapticdb.kernels.resident.cell_frames import evaluate_frame
 from hapticdb.kernels.resident.cells import (
     begin_frame,
     end_frame,
 )
-from hapticdb.kernels.resident.feeling import felt
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import is_rigid, numbers_of, pose_of_quaternion
 
@@ -87,19 +87,19 @@ def move_by_coupling(slot, which, clock):
     cells, servo = cells_of(slot), slot.servo
     tool, sent, follower, spring = servo.tool, servo.sent, slot.follower, spring_of(slot)
     version = cells.readers[slot.reader].version
-    grasp = Grasp(
+    query = ProximityQuery(
         cells, which, shell, place, follower, memory.kept, memory.near, memory.bends, memory.met,
         memory.missed[0],
     )  # fmt: skip
     is_anew = tool.version != version
-    advance(grasp, version, spring, servo, clock.dt)
+    advance(query, version, spring, servo, clock.dt)
     sent.marks |= IS_ANEW if is_anew else 0
     pose_of_quaternion(*numbers_of(tool), memory.pose)
     sent.revision = cells.readers[slot.reader].revision
     if slot.begun - slot.shown_at >= SHOW_EVERY_NS:
         slot.shown_at = slot.begun
-        show_contacts(slot, grasp, memory.pose, spring)
-    slot.n_touching = list_touching(grasp, sent.hits)
+        show_contacts(slot, query, memory.pose, spring)
+    slot.n_touching = list_touching(query, sent.hits)
     return 0
 
 
@@ -120,7 +120,7 @@ def feel(slot, which, laws):
     which : index of the directory of cells; laws : pointer to the law.
     """
     law, memory = laws[0], memory_of(slot)
-    felt(
+    evaluate_frame(
         law, _cells(law, slot), which, tool_of(slot), memory.pose, grid_of(slot),
         memory.met, memory.missed[0], memory.felt[0],
     )  # fmt: skip
@@ -167,7 +167,7 @@ def move_directly(slot, which, clock):
     sent = servo.sent
     pose_of_quaternion(*numbers_of(servo.hand), memory.pose)
     if is_rigid(memory.pose):
-        call_kernel(clock.feeler, slot, which, clock.law)
+        call_kernel(clock.batch_tool, slot, which, clock.law)
         sent.revision = voxels_of(slot).readers[slot.reader].revision
     render(spring_of(slot), tool_of(slot).center, servo, memory.felt[0], clock.dt)
     pose_of_quaternion(*numbers_of(servo.tool), memory.pose)
@@ -176,14 +176,14 @@ def move_directly(slot, which, clock):
 
 
 @leaf
-def _ask_objects(slot, request, shell, place, memory, heartbeat):
+def _request_objects(slot, request, shell, place, memory, heartbeat):
     """Request the ids of touched objects from the fetching process, and publish those received.
 
     A request without end would be answered again at each write, for voxels no longer touched. A
     request withdrawn immediately would never be answered by a slow database.
     """
     sent = slot.servo.sent
-    if sent.hits > 0 or sent.marks & IS_LOOSE:
+    if sent.hits > 0 or sent.marks & IS_INSIDE:
         name_voxels(
             request, shell, memory.pose, place, slot.bits, slot.curve, memory.met,
             slot.n_touching,
@@ -232,7 +232,7 @@ def _run_period(slot, ring, clock):
         return
     if begun - slot.answered_at >= ASK_EVERY_NS:
         slot.answered_at = begun
-        _ask_objects(slot, request, shell, place, memory, heartbeat)
+        _request_objects(slot, request, shell, place, memory, heartbeat)
     slot.last = begun
     elapsed = 1e-9 * (now_ns(clock.moment) - begun)
     time = 1e-9 * (begun - slot.began)

@@ -22,9 +22,9 @@ from hapticdb.kernels.records.hand import BENDS, NEAR, POINT, RESULT
 from hapticdb.kernels.resident.cells import (
     CELL_WORDS,
     SCRATCH_ROWS,
+    CellGrid,
     Cells,
     Clusters,
-    Place,
 )
 
 if config.DISABLE_JIT:
@@ -108,7 +108,8 @@ class Memory(NamedTuple):
     """Arrays shared by the parts of a period.
 
     pose (4, 4): of the tool; `felt`, missed (1,) of RESULT and MISSED: the law's frame, as from
-    `feeling.felt`; `met`, `kept`, near, bends: of the tool's points, as in `near_points.Grasp`.
+    `cell_frames.evaluate_frame`; `met`, `kept`, near, bends: of the tool's points, as in
+    `near_points.ProximityQuery`.
     """
 
     pose: NDArray[np.float64]
@@ -139,7 +140,7 @@ def memory_of(slot):
 def grid_of(slot):
     """Grid of a request."""
     place = slot.place
-    return Place(place[0], place[1], place[2], place[3], place[4])
+    return CellGrid(place[0], place[1], place[2], place[3], place[4])
 
 
 @leaf

@@ -7,10 +7,10 @@ import numpy as np
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.curves import key_of
 from hapticdb.kernels.hand.device_spring import contact_stiffness
-from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD
+from hapticdb.kernels.hand.fading import IS_FADING, IS_HELD
 from hapticdb.kernels.hand.near_points import FLOOR, depth_of
-from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_LOOSE, IS_SOFTER
-from hapticdb.kernels.records.cells import MOST_ASKED
+from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_INSIDE, IS_SOFTER
+from hapticdb.kernels.records.cells import MOST_OBJECT_REQUESTS
 from hapticdb.kernels.records.session import MOST_SHOWN, TIME_BIN, TIME_BINS
 from hapticdb.kernels.resident.cells import in_voxels
 from hapticdb.kernels.resident.fence import fence
@@ -49,9 +49,9 @@ def tell(request, hand, pose, center, radius, missed):
 def name_voxels(request, shell, pose, place, bits, curve, met, n_hits):
     """Request the ids of the objects in the voxels hit by a placed shell: write the voxels' keys.
 
-    `met` (n_hits,): indices of the hits, decimated to at most MOST_ASKED.
+    `met` (n_hits,): indices of the hits, decimated to at most MOST_OBJECT_REQUESTS.
     """
-    step = max((n_hits + MOST_ASKED - 1) // MOST_ASKED, 1)
+    step = max((n_hits + MOST_OBJECT_REQUESTS - 1) // MOST_OBJECT_REQUESTS, 1)
     count = 0
     transform = transform_of(pose)
     for hit in range(0, n_hits, step):
@@ -65,18 +65,18 @@ def name_voxels(request, shell, pose, place, bits, curve, met, n_hits):
 
 
 @leaf
-def list_touching(grasp, n_hits):
-    """Number of touching points, listed in `grasp.met`.
+def list_touching(query, n_hits):
+    """Number of touching points, listed in `query.contacts`.
 
     For a loose tool (inside an object, without contacts) these are the points inside. Their voxels
     may be free: the fetching process also searches around them.
     """
-    if not grasp.follower.is_loose:
+    if not query.follower.is_loose:
         return n_hits
-    near, n_found = grasp.near[grasp.follower.side], np.int64(0)
-    for m in range(grasp.follower.n_near):
+    near, n_found = query.near[query.follower.side], np.int64(0)
+    for m in range(query.follower.n_near):
         if near[m].u < FLOOR:
-            grasp.met[n_found] = near[m].point
+            query.contacts[n_found] = near[m].point
             n_found += 1
     return n_found
 
@@ -111,7 +111,7 @@ def note(ring, slot, time, dt, lateness, elapsed):
     state |= FADING if sent.marks & IS_FADING else 0
     state |= STALE if hand.is_stale else 0
     state |= ANEW if sent.marks & IS_ANEW else 0
-    row.state = state | (IN_OBJECT if sent.marks & IS_LOOSE else 0)
+    row.state = state | (IN_OBJECT if sent.marks & IS_INSIDE else 0)
 
 
 @leaf
@@ -128,11 +128,11 @@ def count(slot):
     slot.unknown_frames += sent.unknown > 0
     slot.held_frames += (marks & IS_HELD) != 0
     slot.stale_frames += hand.is_stale
-    slot.nowhere_frames += math.isnan(hand.position[0])
-    slot.ended_loose = (marks & IS_LOOSE) != 0
-    if slot.ended_loose and slot.loose_frames == 0:
-        slot.first_loose_frame = slot.n_frames
-    slot.loose_frames += slot.ended_loose
+    slot.invalid_frames += math.isnan(hand.position[0])
+    slot.ended_inside = (marks & IS_INSIDE) != 0
+    if slot.ended_inside and slot.inside_frames == 0:
+        slot.first_inside_frame = slot.n_frames
+    slot.inside_frames += slot.ended_inside
     slot.guard_actions += (marks & IS_SOFTER) != 0
     slot.least_share = follower.wanted_share if follower.wanted_share > 0.0 else 1.0
 
@@ -153,24 +153,24 @@ def count_times(slot, lateness, elapsed):
 
 
 @leaf
-def show_contacts(slot, grasp, pose, spring):
+def show_contacts(slot, query, pose, spring):
     """Publish points, m, and forces, N, of at most MOST_SHOWN contacts in the slot, world frame."""
-    follower, points, transform = grasp.follower, grasp.shell.points, transform_of(pose)
-    near, n_near = grasp.near[follower.side], 0 if follower.is_loose else follower.n_near
-    stiffness = contact_stiffness(spring, grasp.place.size)
+    follower, points, transform = query.follower, query.shell.points, transform_of(pose)
+    near, n_near = query.near[follower.side], 0 if follower.is_loose else follower.n_near
+    stiffness = contact_stiffness(spring, query.grid.size)
     n_contacts = 0
     for m in range(n_near):
-        n_contacts += depth_of(grasp, near[m]) > 0.0
+        n_contacts += depth_of(query, near[m]) > 0.0
     every = max((n_contacts + MOST_SHOWN - 1) // MOST_SHOWN, 1)
     slot.contacts_sequence += 1
     fence()
-    n_met = n_shown = 0
+    n_published = n_shown = 0
     for m in range(n_near):
-        n, depth = near[m].point, depth_of(grasp, near[m])
+        n, depth = near[m].point, depth_of(query, near[m])
         if depth <= 0.0:
             continue
-        n_met += 1
-        if (n_met - 1) % every == 0:
+        n_published += 1
+        if (n_published - 1) % every == 0:
             row, force = slot.contacts[n_shown], stiffness * depth
             row[0], row[1], row[2] = moved(transform, points[n, 0], points[n, 1], points[n, 2])
             for axis in range(3):
@@ -184,7 +184,7 @@ def show_contacts(slot, grasp, pose, spring):
 @leaf
 def show_objects(slot, request):
     """Copy the ids of touched objects from the request queue to the slot."""
-    n_objects = min(request.n_objects, np.int64(MOST_ASKED))
+    n_objects = min(request.n_objects, np.int64(MOST_OBJECT_REQUESTS))
     for n in range(n_objects):
         slot.objects[n] = request.objects[n]
     slot.n_objects = n_objects

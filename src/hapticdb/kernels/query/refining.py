@@ -21,8 +21,8 @@ from hapticdb.kernels._jit import (
     maker,
     record_of,
 )
-from hapticdb.kernels.field.law import DISTANCE_FIELD
-from hapticdb.kernels.law import (
+from hapticdb.kernels.field.distance_law import DISTANCE_FIELD
+from hapticdb.kernels.force_law import (
     NO_WRENCH,
     NOTHING_NEAR,
     TANGENT_PLANE,
@@ -33,8 +33,8 @@ from hapticdb.kernels.law import (
     sample_rows,
     share_rows,
 )
-from hapticdb.kernels.query.contact import center_of, voxel_at
-from hapticdb.kernels.query.grouping import first_bound
+from hapticdb.kernels.query.key_ranges import first_bound
+from hapticdb.kernels.query.shell_keys import center_of, voxel_at
 from hapticdb.kernels.query.sorting import insert_distinct
 from hapticdb.kernels.records.rows import GRID
 
@@ -69,12 +69,12 @@ def _counting_rows(row_ids, exclude):
     """Mask (R,) bool of the rows whose objects are not in exclude (E,), ascending and distinct."""
     counts = np.empty(row_ids.shape[0], dtype=np.bool_)
     for row in range(row_ids.shape[0]):
-        counts[row] = is_felt(row_ids[row], exclude)
+        counts[row] = is_included(row_ids[row], exclude)
     return counts
 
 
 @inlined
-def is_felt(object_id, exclude):
+def is_included(object_id, exclude):
     """Whether an object is not in exclude (E,), ascending and distinct.
 
     The search starts at a lower bound of the id's index: id - exclude[0], less the number of gaps
@@ -97,12 +97,12 @@ def _has_voxel(occupancy, row, address):
 
 
 @inlined
-def _distinct_ids(touched, row_ids, met, start):
-    """Write the distinct ids of touched rows into `met[start:]`, ascending -> number of ids."""
+def _distinct_ids(touched, row_ids, indices, start):
+    """Write the distinct ids of touched rows into `indices[start:]`, ascending -> number of ids."""
     count = np.int64(0)
     for row in range(row_ids.shape[0]):
         if touched[row]:
-            count = insert_distinct(met, start, count, row_ids[row])
+            count = insert_distinct(indices, start, count, row_ids[row])
     return count
 
 
@@ -175,14 +175,14 @@ NO_TALLY = (NO_WRENCH, 0.0, 0, 0)
 
 
 @inlined
-def feel_point(
-    law, payload, counts, touched, occupancy, rows, least, n, address, placed, place, felt, met,
-    tally,
+def accumulate_point(
+    law, payload, counts, touched, occupancy, rows, least, n, address, placed, place, result,
+    indices, tally,
 ):  # fmt: skip
     """Evaluate the law at point n of a placed shell; return the tally with the point added.
 
     rows : first row of the point's brick and the row behind its last; least : the same of the rows
-    with the brick's least distances; `felt`, `met` as for `refine`; `tally` as `NO_TALLY`.
+    with the brick's least distances; `result`, `indices` as for `refine`; `tally` as `NO_TALLY`.
     """
     total = placed.shape[0] - 1
     first, end = rows
@@ -203,12 +203,12 @@ def feel_point(
     depth *= share
     weight += counted * share
     if is_hit:
-        met[n_hits] = n
-        felt[6 + n_hits] = max(depth, 0.0)
+        indices[n_hits] = n
+        result[6 + n_hits] = max(depth, 0.0)
         n_hits += 1
     elif depth > 0.0:
-        met[total + n_apart] = n
-        felt[6 + total + n_apart] = depth
+        indices[total + n_apart] = n
+        result[6 + total + n_apart] = depth
         n_apart += 1
     if depth > 0.0:
         _touch_near_rows(
@@ -224,36 +224,47 @@ def feel_point(
     FLOATS, INTS, also=BY_DISTANCE,
 )  # fmt: skip
 def refine(
-    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, felt, met
+    placed,
+    addresses,
+    keys,
+    row_keys,
+    row_ids,
+    occupancy,
+    payload,
+    exclude,
+    grid,
+    law,
+    result,
+    indices,
 ):
     """Drop the false hits of a frame's rows and sum the wrench of its contacts -> H, A and I.
 
-    `placed`, `asked`, `keys` of `Located`; row_keys (R,), ascending, and row_ids (R,); occupancy
-    (64 R,), or empty for voxel rows; payload (R, 1000), the rows' distances, or None for a law
-    without payload; exclude (E,), ascending.
+    `placed`, `addresses`, `keys` of `Located`; row_keys (R,), ascending, and row_ids (R,);
+    occupancy (64 R,), or empty for voxel rows; payload (R, 1000), the rows' distances, or None for
+    a law without payload; exclude (E,), ascending.
 
-    Output `felt` (6 + 2 N,): wrench about the centre, world frame, N and N m; from 6 on the depths
-    of the H hits, metres, 0 without contact; from 6 + N on those of the A contacts without a hit.
-    Output `met` (2 N + R,): the H indices, ascending; from N on the A indices; from 2 N on the I
-    ids of the objects around the hits or in contact.
+    Output `result` (6 + 2 N,): wrench about the centre, world frame, N and N m; from 6 on the
+    depths of the H hits, metres, 0 without contact; from 6 + N on those of the A contacts without a
+    hit. Output `indices` (2 N + R,): the H indices, ascending; from N on the A indices; from 2 N on
+    the I ids of the objects around the hits or in contact.
     """
-    place, total = grid[()], asked.shape[1]
+    place, total = grid[()], addresses.shape[1]
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     starts, ends = _rows_of_keys(keys, row_keys)
     counts = _counting_rows(row_ids, exclude)
     tally = NO_TALLY
     for n in range(total):
-        if asked[1, n] < 0:
+        if addresses[1, n] < 0:
             continue
-        rows = starts[asked[1, n]], ends[asked[1, n]]
+        rows = starts[addresses[1, n]], ends[addresses[1, n]]
         if rows[0] != rows[1]:
-            tally = feel_point(
-                law, payload, counts, touched, occupancy, rows, rows, n, asked[0, n], placed,
-                place, felt, met, tally,
+            tally = accumulate_point(
+                law, payload, counts, touched, occupancy, rows, rows, n, addresses[0, n], placed,
+                place, result, indices, tally,
             )  # fmt: skip
     sums, weight, n_hits, n_apart = tally
-    average_into(felt, weight, sums)
-    return n_hits, n_apart, _distinct_ids(touched, row_ids, met, 2 * total)
+    average_into(result, weight, sums)
+    return n_hits, n_apart, _distinct_ids(touched, row_ids, indices, 2 * total)
 
 
 @entry(
@@ -261,7 +272,7 @@ def refine(
     also=BY_DISTANCE,
 )  # fmt: skip
 def pairs_of_points(
-    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, chosen
+    placed, addresses, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, chosen
 ):
     """Touching (point, object) pairs (P, 2) of chosen points (C,) of a frame, ordered by both.
 
@@ -274,16 +285,16 @@ def pairs_of_points(
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     most = 0
     for c in range(chosen.shape[0]):
-        slot = asked[1, chosen[c]]
+        slot = addresses[1, chosen[c]]
         most += ends[slot] - starts[slot]
     pairs = np.empty((most, 2), dtype=np.int64)
     count = 0
     for c in range(chosen.shape[0]):
         n = chosen[c]
-        first, end = starts[asked[1, n]], ends[asked[1, n]]
+        first, end = starts[addresses[1, n]], ends[addresses[1, n]]
         is_hit = False
         for row in range(first, end):
-            touched[row] = counts[row] and _has_voxel(occupancy, row, asked[0, n])
+            touched[row] = counts[row] and _has_voxel(occupancy, row, addresses[0, n])
             is_hit |= touched[row]
         at = _in_grid(placed, n, place)
         sample = sample_rows(law, payload, counts, first, end, *at)
@@ -300,17 +311,17 @@ def pairs_of_points(
 
 
 @entry(INTS, INTS)
-def asked_rows(keys, row_keys):
+def requested_rows(keys, row_keys):
     """Mask (R,) of the rows with requested keys; the others are the false hits.
 
     keys (U,) and row_keys (R,) int64, both ascending.
     """
     starts, ends = _rows_of_keys(keys, row_keys)
-    is_asked = np.zeros(row_keys.shape[0], dtype=np.bool_)
+    is_requested = np.zeros(row_keys.shape[0], dtype=np.bool_)
     for n in range(keys.shape[0]):
         for row in range(starts[n], ends[n]):
-            is_asked[row] = True
-    return is_asked
+            is_requested[row] = True
+    return is_requested
 
 
 @entry(FLOATS2, INTS, INTS, record_of(GRID), TANGENT_PLANE, FLOATS)

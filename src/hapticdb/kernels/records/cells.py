@@ -5,7 +5,7 @@ from hapticdb.kernels.records.layout import Layout, record, record_in_lines
 MOST_MISSED = 63
 """Most unknown cells in a frame's list for the prefetch process. Larger: fewer rounds of fetching
 for a tool deep in unknown cells, and more comparisons for each unknown cell of a frame."""
-MOST_ASKED = 64
+MOST_OBJECT_REQUESTS = 64
 """Most voxels in a session's request for object ids, and most ids in the reply. Larger: ids of
 small objects arrive sooner, and the statement is longer."""
 BUFFERS = 3
@@ -61,13 +61,13 @@ REQUEST: Layout = record_in_lines(
             ("prefetch", PREFETCH_REQUEST),
             ("missed", MISSED),  # of the last frame
             ("n_asked", "<i8"),
-            ("asked", "<i8", MOST_ASKED),  # keys of voxels, for the ids of their objects
+            ("asked", "<i8", MOST_OBJECT_REQUESTS),  # keys of voxels, for the ids of their objects
         ],
         [  # written by the prefetch process
             ("heard", "<i8"),  # last sequence number read
             ("n_missing", "<i8"),  # unknown cells of that request
             ("n_objects", "<i8"),
-            ("objects", "<i8", MOST_ASKED),  # ids of the objects in the requested voxels
+            ("objects", "<i8", MOST_OBJECT_REQUESTS),  # ids of the objects in the requested voxels
         ],
     ],
     REQUEST_BYTES,

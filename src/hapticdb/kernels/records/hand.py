@@ -39,7 +39,7 @@ HANDLE: Layout = record(
         ("quaternion", "<f8", 4),
     ]
 )
-"""Transform from a device's readings to a handle (`kernels.hand.handle`)."""
+"""Transform from a device's readings to a handle (`kernels.hand.handle_motion`)."""
 
 READING: Layout = record([("pose", "<f8", (4, 4)), ("velocity", "<f8", 6), ("buttons", "<i8")])
 """Reading of a device (`hapticdb.devices.protocol.Reading`)."""
@@ -67,7 +67,7 @@ SENT: Layout = record(
         ("unknown", "<i8"),  # points, at the tried pose
         ("deepest", "<f8"),  # m
         ("n_steps", "<i8"),
-        ("marks", "<i8"),  # bits of `kernels.hand.holding`; `flags` is a name of NumPy's
+        ("marks", "<i8"),  # bits of `kernels.hand.fading`; `flags` is a name of NumPy's
         ("revision", "<i8"),  # of the database
     ]
 )
@@ -81,12 +81,12 @@ MOST_TRAIL = 64
 time span at higher loop rates."""
 FOLLOWER: Layout = record(
     [
-        ("looked_at", "<f8", 7),  # pose of the tool for the near points
+        ("queried_at", "<f8", 7),  # pose of the tool for the near points
         ("travelled", "<f8"),  # path length of the farthest point, upper bound, voxels
         ("astray", "<f8"),  # voxels from the tool's pose to that of the last query
         ("clearance", "<f8"),  # least distance of points, lower bound, at the tool's pose, voxels
         ("tried_clearance", "<f8"),  # the same at the pose of the last query
-        # the equations of a step (`kernels.hand.step`)
+        # the equations of a step (`kernels.hand.gauss_newton`)
         ("side", "<i8"),  # 0 or 1: half of the rows for the near points at the tool's pose
         ("n_near", "<i8"),  # near points at the tool's pose
         ("n_active", "<i8"),  # points in the contact set of the last step
@@ -99,8 +99,8 @@ FOLLOWER: Layout = record(
         ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad of the scene
         ("n_tried", "<i8"),  # near points at the pose of the last query, in the other half
         ("n_unknown", "<i8"),  # points in unknown cells there
-        ("n_looks", "<i8"),  # queries in this period
-        ("is_walking", "?"),  # the pose of the query may be forbidden
+        ("n_queries", "<i8"),  # queries in this period
+        ("is_advancing", "?"),  # the pose of the query may be forbidden
         ("is_loose", "?"),  # the tool is inside an object, without contacts yet
         ("is_braked", "?"),  # the last step was shortened: the next one is braked
         ("last_hand", "<f8", 3),  # the handle's position in the last period, m
@@ -117,7 +117,7 @@ FOLLOWER: Layout = record(
         ("merges_from", "<i8"),  # set by the caller: number of near points to merge at; 0: never
         ("merged", "<i8"),  # points for each contact; 0 counts as 1
         # of queries on a GPU
-        ("looker", "<i8"),  # address of the callback of a query; 0: on the CPU
+        ("gpu_query", "<i8"),  # address of the callback of a query; 0: on the CPU
         ("way", "<f8"),  # motion of the farthest point since the last query, voxels
         ("anew", "<i8"),  # reset before the next query: a code of `near_points`
     ]
@@ -175,7 +175,7 @@ QUERY: Layout = record(
         ("n_due", "<i8"),  # runs of its second launch
     ]
 )
-"""Parameters of a query on the GPU (`kernels.gpu.looks`)."""
+"""Parameters of a query on the GPU (`kernels.gpu.proximity_queries`)."""
 
 FRAME: Layout = np.dtype(
     [

@@ -30,7 +30,7 @@ BRICK: Layout = record(
         ("filter", "<i4"),  # number of the filter for `least`
     ]
 )
-"""Directory entry of a cached brick (`kernels.query.bricks`), in a hash table by key."""
+"""Directory entry of a cached brick (`kernels.query.brick_frames`), in a hash table by key."""
 
 
 def _decoded(n_values: int) -> Layout:
@@ -57,4 +57,4 @@ NEAR_CUBE: Layout = record(
         ("unused", "<i8"),  # padding: no record crosses a cache line
     ]
 )
-"""Cached distance of a cube of space, one cache a thread (`kernels.resident.nearest`)."""
+"""Cached distance of a cube of space, one cache a thread (`kernels.resident.nearest_voxels`)."""

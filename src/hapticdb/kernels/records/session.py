@@ -1,6 +1,6 @@
 """Records of a loop: the slot of a session, with all of its state, and the loop's clock."""
 
-from hapticdb.kernels.records.cells import MOST_ASKED
+from hapticdb.kernels.records.cells import MOST_OBJECT_REQUESTS
 from hapticdb.kernels.records.hand import FOLLOWER, HANDLE, READING, SERVO
 from hapticdb.kernels.records.layout import Layout, record
 
@@ -56,12 +56,12 @@ SLOT: Layout = record(
         ("follower", FOLLOWER),
         *_integers("n_touching began begun last requested_at answered_at asked_at shown_at"),
         *_integers("n_frames missed_deadlines hit_frames contact_frames unknown_frames"),
-        *_integers("held_frames stale_frames nowhere_frames loose_frames first_loose_frame"),
-        *_integers("ended_loose guard_actions"),
+        *_integers("held_frames stale_frames invalid_frames inside_frames first_inside_frame"),
+        *_integers("ended_inside guard_actions"),
         *((name, "<f8") for name in ("peak_force", "peak_torque", "deepest", "least_share")),
         *((name, "<f8") for name in ("worst_lateness", "worst_elapsed")),
         ("n_objects", "<i8"),
-        ("objects", "<i8", MOST_ASKED),
+        ("objects", "<i8", MOST_OBJECT_REQUESTS),
         *_integers("contacts_sequence n_contacts"),
         ("contacts", "<f8", (MOST_SHOWN, 6)),
         ("lateness", "<i8", TIME_BINS + 1),
@@ -123,7 +123,7 @@ LOOP_CLOCK: Layout = record(
         ("dt", "<f8"),  # s since the one before
         ("moment", "<i8", 4),  # scratch of the system clock
         # addresses: of the kernels of tool motion and of a frame, and of the law's numbers
-        *_integers("mover feeler law"),
+        *_integers("mover batch_tool law"),
     ]
 )
 """Clock and control of the servo loop: its inputs, and its progress."""

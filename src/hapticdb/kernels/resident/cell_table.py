@@ -29,7 +29,7 @@ from hapticdb.kernels.field.lattice import (
 )
 from hapticdb.kernels.records.cells import BUFFERS, CONTROL, READER
 from hapticdb.kernels.resident.cells import (
-    PLACE,
+    CELL_GRID,
     Ints,
     brick_bit,
     cells_of_box,
@@ -78,10 +78,10 @@ def remove_cells(keys, slots, which, old_keys):
 
 
 @entry(INTS2, INTS32_2, INT, INTS, INTS)
-def slots_of_cells(keys, slots, which, asked, out):
+def slots_of_cells(keys, slots, which, requested, out):
     """Slots (n,) of cells (n,) in directory `which`; UNKNOWN for a cell without an entry."""
-    for n in range(asked.shape[0]):
-        out[n] = slot_of(keys, slots, which, asked[n])
+    for n in range(requested.shape[0]):
+        out[n] = slot_of(keys, slots, which, requested[n])
 
 
 @leaf
@@ -251,7 +251,7 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
     there, in voxels, 0 for a cell in the sphere at the start. Returns the number of cells.
     """
     length = move[0] * move[0] + move[1] * move[1] + move[2] * move[2]
-    way = np.sqrt(length)
+    distance = np.sqrt(length)
     count = 0
     for i in range(first[0], last[0] + 1):
         x = 32.0 * i + 16.0
@@ -278,13 +278,13 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
                     keys[count] = key_of_cell(i, j, k)
                     urgency[count] = 0.0
                     if dx * dx + dy * dy + dz * dz > radius * radius:
-                        urgency[count] = max(gap, 0.0) + along * way
+                        urgency[count] = max(gap, 0.0) + along * distance
                     count += 1
     return count
 
 
-@entry(FLOATS2, INT, INT, FLOAT, FLOATS3, PLACE, INTS, INT)
-def cells_met(points, first, least, reach, poses, place, found, most):
+@entry(FLOATS2, INT, INT, FLOAT, FLOATS3, CELL_GRID, INTS, INT)
+def cells_in_reach(points, first, least, reach, poses, grid, found, most):
     """Distinct cells within `reach` voxels of points (N, 3+) at the first of poses (M, 4, 4).
 
     At poses[0] only points from `first` on count. The cells go into found (capacity,) int64, an
@@ -292,15 +292,15 @@ def cells_met(points, first, least, reach, poses, place, found, most):
     than `most` cells, but not before point `least` of the first pose. Returns the number of
     complete poses, and of cells.
     """
-    end, count = place.side + reach, np.int64(0)
-    memo = cells_of_box(-1.0, -1.0, -1.0, 0.0, place.side)
+    end, count = grid.side + reach, np.int64(0)
+    memo = cells_of_box(-1.0, -1.0, -1.0, 0.0, grid.side)
     for n in range(poses.shape[0]):
         transform = transform_of(poses[n])
         for p in range(first if n == 0 else 0, points.shape[0]):
-            x, y, z = in_voxels(transform, place, points[p, 0], points[p, 1], points[p, 2])
+            x, y, z = in_voxels(transform, grid, points[p, 0], points[p, 1], points[p, 2])
             if not (-reach <= x < end and -reach <= y < end and -reach <= z < end):
                 continue
-            box = cells_of_box(x, y, z, reach, place.side)
+            box = cells_of_box(x, y, z, reach, grid.side)
             if box == memo:
                 continue
             memo = box

@@ -97,7 +97,7 @@ class Seen(NamedTuple):
     which: int
 
 
-class Place(NamedTuple):
+class CellGrid(NamedTuple):
     """Grid for kernels: origin x, y, z and voxel size in metres, voxels on each axis (side)."""
 
     x: float
@@ -107,7 +107,7 @@ class Place(NamedTuple):
     side: float
 
 
-PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
+CELL_GRID = fields_of(CellGrid, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 
 SCRATCH_ROWS = 24
@@ -170,10 +170,10 @@ def cells_of_box(x, y, z, reach, side):
 
 
 @inlined
-def in_voxels(transform, place, x, y, z):
+def in_voxels(transform, grid, x, y, z):
     """Point of the tool, metres, transformed by a pose, in voxels from the grid's origin."""
     x, y, z = moved(transform, x, y, z)
-    return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
+    return (x - grid.x) / grid.size, (y - grid.y) / grid.size, (z - grid.z) / grid.size
 
 
 @leaf

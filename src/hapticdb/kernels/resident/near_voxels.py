@@ -14,8 +14,8 @@ above the least mean. The bound is exact for distances falling along each axis i
 import numpy as np
 
 from hapticdb.kernels._jit import BYTES2, INTS, WORDS, WORDS32_2, entry
+from hapticdb.kernels.field.distance_law import REACH
 from hapticdb.kernels.field.lattice import CELL_SIDE, STEPS, VOXELS_A_STEP
-from hapticdb.kernels.field.law import REACH
 from hapticdb.kernels.resident.cells import CELL_WORDS
 
 MOST_EIGHTHS = int(8 * REACH / VOXELS_A_STEP)

@@ -33,15 +33,15 @@ FURTHEST = float(1 << 22)
 
 Scratch = namedtuple(  # noqa: PYI024 - each field is an array (run,) of floats
     "Scratch",
-    "px py pz x y z nx ny nz number base word bit kept look_up part_x part_y part_z here there "
-    "depth weight slot_of base_of",
+    "px py pz x y z nx ny nz number base word bit kept to_interpolate part_x part_y part_z here "
+    "there depth weight slot_of base_of",
 )
 """Placed run of a shell: rows of `Clusters.scratch`, each with a number for each point.
 
 px, py, pz : metres. x, y, z : voxels. nx, ny, nz : rotated normal. number : index of the point.
 base : start of its cell's distances, less the offset of the cell's first centre. word, bit : of
-its voxel, in the words of the whole table. kept : indices for `keep_points`. look_up : index of
-the lowest corner of an interpolation. part_x, part_y, part_z : fractions between its corners.
+its voxel, in the words of the whole table. kept : indices for `keep_points`. to_interpolate : index
+of the lowest corner of an interpolation. part_x, part_y, part_z : fractions between its corners.
 here, there : distance at the point and ahead of it, voxels. depth : m. weight. slot_of,
 base_of : of the run's cells.
 
@@ -109,24 +109,24 @@ def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
                     continue
                 if n_columns > MOST_COLUMNS:
                     return True
-                met = np.uint32(0)
+                hit_bits = np.uint32(0)
                 for i in range(i0, i1 + 1):
                     for word in range((i << 5) | j0, ((i << 5) | j1) + 1):
-                        met |= words[slot, word]
-                if met & _COLUMNS[k0, k1]:
+                        hit_bits |= words[slot, word]
+                if hit_bits & _COLUMNS[k0, k1]:
                     is_near = True
     return is_near
 
 
 @inlined
-def _is_sphere_free(seen, spheres, n, transform, place, reached):
+def _is_sphere_free(seen, spheres, n, transform, grid, reached):
     """Whether no voxel is in the AABB of sphere n of a placed shell, enlarged by `reached` voxels.
 
     Unknown cells count as occupied; space outside the grid is free.
     """
-    side = place.side
-    x, y, z = in_voxels(transform, place, spheres[n, 0], spheres[n, 1], spheres[n, 2])
-    radius = spheres[n, 3] / place.size + reached
+    side = grid.side
+    x, y, z = in_voxels(transform, grid, spheres[n, 0], spheres[n, 1], spheres[n, 2])
+    radius = spheres[n, 3] / grid.size + reached
     if x + radius < 0.0 or y + radius < 0.0 or z + radius < 0.0:
         return True
     if x - radius >= side or y - radius >= side or z - radius >= side:
@@ -143,7 +143,7 @@ def _is_sphere_free(seen, spheres, n, transform, place, reached):
 
 
 @inlined
-def _free_runs(seen, shell, run, transform, place, reached):
+def _free_runs(seen, shell, run, transform, grid, reached):
     """Number of runs, from `run` on, farther than `reached` voxels from all: BLOCK, GROUP, 1 or 0.
 
     A shell without spheres lists in `groups` the runs to skip, or has no groups: then it is 0.
@@ -154,21 +154,21 @@ def _free_runs(seen, shell, run, transform, place, reached):
     n_runs = spheres.shape[0]
     if run % BLOCK == 0 and n_runs >= BLOCK:
         block = (n_runs + GROUP - 1) // GROUP + run // BLOCK
-        if _is_sphere_free(seen, groups, block, transform, place, reached):
+        if _is_sphere_free(seen, groups, block, transform, grid, reached):
             return BLOCK
-    if run % GROUP == 0 and _is_sphere_free(seen, groups, run // GROUP, transform, place, reached):
+    if run % GROUP == 0 and _is_sphere_free(seen, groups, run // GROUP, transform, grid, reached):
         return GROUP
-    return 1 if _is_sphere_free(seen, spheres, run, transform, place, reached) else 0
+    return 1 if _is_sphere_free(seen, spheres, run, transform, grid, reached) else 0
 
 
 @inlined
-def next_run(seen, shell, run, end, transform, place, reached):
+def next_run(seen, shell, run, end, transform, grid, reached):
     """First run, from `run` on and before `end`, possibly near a voxel; `end` or more without one.
 
     All frames and searches traverse a shell by it, forwards.
     """
     while run < end:
-        n_free = _free_runs(seen, shell, run, transform, place, reached)
+        n_free = _free_runs(seen, shell, run, transform, grid, reached)
         if n_free == 0:
             break
         run += n_free
@@ -176,13 +176,13 @@ def next_run(seen, shell, run, end, transform, place, reached):
 
 
 @inlined
-def place_run(shell, run, transform, place, scratch):
+def place_run(shell, run, transform, grid, scratch):
     """Place the points of a run: scratch takes metres and voxels.
 
     Returns the first point and their number. One loop for each axis, for vectorization: this halves
     the time of a flat frame of 100,000 points.
     """
-    ox, oy, oz, size, columns = place.x, place.y, place.z, place.size, shell.columns
+    ox, oy, oz, size, columns = grid.x, grid.y, grid.z, grid.size, shell.columns
     start = run * shell.run
     count = min(shell.run, columns.shape[1] - start)
     for at in range(count):
@@ -231,7 +231,7 @@ def cells_of_run(seen, count, side, scratch):
     is_inside = min(i0, j0, k0) >= 0 and max(i1, j1, k1) < side
     if not is_inside or n_cells > min(MOST_CELLS, count):
         return np.int64(UNKNOWN), n_j, n_k, ci, cj, ck
-    met = np.uint64(0)
+    hit_bits = np.uint64(0)
     for n in range(n_cells):
         i, j, k = ci + n // (n_j * n_k), cj + n // n_k % n_j, ck + n % n_k
         slot = slot_of(seen.keys, seen.slots, seen.which, key_of_cell(i, j, k))
@@ -239,11 +239,11 @@ def cells_of_run(seen, count, side, scratch):
             return np.int64(UNKNOWN), n_j, n_k, ci, cj, ck
         if slot > EMPTY_SLOT:
             seen.used[slot] = 1
-            met |= seen.masks[slot]
+            hit_bits |= seen.masks[slot]
         scratch.slot_of[n] = slot
         first = cell_place(np.int64(0), np.int64(0), np.int64(0)) + slot * CELL_VALUES
         scratch.base_of[n] = float(first - place_before(i << 5, j << 5, k << 5))
-    return n_cells if met else np.int64(0), n_j, n_k, ci, cj, ck
+    return n_cells if hit_bits else np.int64(0), n_j, n_k, ci, cj, ck
 
 
 @inlined

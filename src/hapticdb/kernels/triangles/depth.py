@@ -29,16 +29,16 @@ from hapticdb.kernels._jit import (
     leaf,
 )
 from hapticdb.kernels.rigid import moved, transform_of, turn
-from hapticdb.kernels.surfaces.nearest import distance_at, square_to_triangle
-from hapticdb.kernels.surfaces.sides import (
+from hapticdb.kernels.surfaces.point_distance import distance_at, square_to_triangle
+from hapticdb.kernels.surfaces.triangle_bvh import (
     LEAF_SIZE,
     STACK,
     TREE,
-    TriangleTree,
+    TriangleBVH,
     crossings,
     directions_of,
 )
-from hapticdb.kernels.triangles.nearest import middle_of, place_corners
+from hapticdb.kernels.triangles.surface_distance import middle_of, place_corners
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -63,7 +63,7 @@ class Solid(NamedTuple):
     the wall of a void; boxes (B, 2, 3) : of these; box (2, 3) : of all.
     """
 
-    tree: TriangleTree
+    tree: TriangleBVH
     bodies: Ints
     signs: Ints
     boxes: Floats
@@ -195,11 +195,11 @@ def _search_triangle(solid, lines, tolerance, fine, most, waiting, middle, scrat
     halves whose middles are nearer to it than the surface have the same: 2.3 times fewer nodes.
     """
     nodes, squares, stack, sides = scratch
-    top, looks = 1, np.int64(0)
+    top, queries = 1, np.int64(0)
     sides[0] = 0
-    while top > 0 and looks < most:
+    while top > 0 and queries < most:
         top -= 1
-        looks += 1
+        queries += 1
         enough = _enough(out, tolerance, fine)
         if _below_box(solid.box, waiting[top]) <= enough:
             continue
@@ -222,7 +222,7 @@ def _search_triangle(solid, lines, tolerance, fine, most, waiting, middle, scrat
             _halve(waiting, top)
             sides[top] = sides[top + 1] = side if far > HALFWAY * radius else 0
             top += 2
-    return hint, looks
+    return hint, queries
 
 
 @entry(SOLID, TREE, FLOATS2, FLOATS2, FLOAT, FLOAT, INT, FLOATS)
@@ -243,10 +243,10 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
         place_corners(surface.corners, n, n + 1, pose, waiting)
         hint = _try_middle(solid, lines, waiting, middle, scratch, hint, out)
     todo[0] = 0
-    first_leaf, looks = surface.boxes.shape[0] // 2, np.int64(0)
-    while top > 0 and looks < most:
+    first_leaf, queries = surface.boxes.shape[0] // 2, np.int64(0)
+    while top > 0 and queries < most:
         top -= 1
-        looks += 1
+        queries += 1
         node = todo[top]
         if surface.boxes[node, 0, 0] > surface.boxes[node, 1, 0]:
             continue
@@ -270,9 +270,9 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
         for n in range(start, min(start + LEAF_SIZE, count)):
             place_corners(surface.corners, n, n + 1, pose, waiting)
             hint, more = _search_triangle(
-                solid, lines, tolerance, fine, most - looks, waiting, middle, scratch, hint, out
+                solid, lines, tolerance, fine, most - queries, waiting, middle, scratch, hint, out
             )
-            looks += more
+            queries += more
 
 
 @entry(FLOATS3, INTS, INTS, INTS, FLOATS2, BOOL, FLOATS2, FLOAT, FLOATS2)
@@ -313,7 +313,7 @@ def _place_corner(corners, n, pose, is_back, place):
 
 
 def depth_in(
-    solid: Solid, surface: TriangleTree, pose: Floats, least: float, tolerance: float, fine: float,
+    solid: Solid, surface: TriangleBVH, pose: Floats, least: float, tolerance: float, fine: float,
     most: int,
 ) -> tuple[float, Floats]:  # fmt: skip
     """Depth of a surface in a solid, and its place (3,), the solid's frame, metres.

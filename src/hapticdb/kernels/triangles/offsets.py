@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import BOOL, FLOAT, FLOATS, FLOATS2, FLOATS3, INT, INTS2, entry, leaf
-from hapticdb.kernels.triangles.nearest import are_near, place_corners
+from hapticdb.kernels.triangles.surface_distance import are_near, place_corners
 
 WHOLE, ACROSS, ALONG = range(3)
 """Direction of an offset: the normal, or its component across or along an axis."""

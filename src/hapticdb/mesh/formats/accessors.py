@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.raw import UnreadableError, beside
+from hapticdb.mesh.parsed import UnreadableError, referenced_path
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -65,7 +65,7 @@ def external_bytes(tree: dict[str, Any], folder: Path) -> int:
     """Total size of the existing files that a glTF file refers to; each file counts once."""
     sizes: dict[tuple[int, int], int] = {}
     for name in {_external_name(buffer) for buffer in objects_of(tree, "buffers")} - {None}:
-        file = beside(folder, str(name))
+        file = referenced_path(folder, str(name))
         if file is not None:
             status = file.stat()
             sizes[status.st_dev, status.st_ino] = status.st_size
@@ -170,7 +170,7 @@ class Accessors:
     def _content(self, number: int, buffer: dict[str, Any]) -> memoryview:
         """Bytes of a buffer; buffers of one file share them."""
         name = _external_name(buffer)
-        file = None if name is None else beside(self._folder, name)
+        file = None if name is None else referenced_path(self._folder, name)
         if name is not None and file is None:
             raise UnreadableError(f"it refers to {name}, which is not beside it")
         key: object = number

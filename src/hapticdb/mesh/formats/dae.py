@@ -16,10 +16,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
-from hapticdb.mesh.part import Defects
-from hapticdb.mesh.polygons import fan, strip, triangulated
-from hapticdb.mesh.raw import (
+from hapticdb.mesh.formats.srgb import Colours, joined, mean_of_corners, rgba
+from hapticdb.mesh.parsed import (
     ANIMATED,
     HIDDEN,
     NameBudget,
@@ -27,11 +25,13 @@ from hapticdb.mesh.raw import (
     Placement,
     Shape,
     UnreadableError,
+    count_note,
+    missing_note,
     numbers,
-    told,
-    told_missing,
     walk,
 )
+from hapticdb.mesh.part import Defects
+from hapticdb.mesh.polygons import fan, strip, triangulated
 from hapticdb.mesh.text import unit_length, xml_of
 from hapticdb.poses import rotation_of
 
@@ -222,16 +222,16 @@ class _Document:
         pictures = ((one.findtext("ref") or one.text or "").strip() for one in images)
         others = sum(1 for _ in root.iter("visual_scene")) - 1
         notes = [
-            *(note for kind, n in strange.items() for note in told(n, _UNREAD, kind=kind)),
-            *told(outside, "geometr{ies} {are} not in its scene and {are} left out"),
-            *told(missing, f"of its {len(wanted)} placements {{refer}} to what is not there"),
-            *told(len(self._damaged), "transform{s} {are} damaged: parts there are left out"),
+            *(note for kind, n in strange.items() for note in count_note(n, _UNREAD, kind=kind)),
+            *count_note(outside, "geometr{ies} {are} not in its scene and {are} left out"),
+            *count_note(missing, f"of its {len(wanted)} placements {{refer}} to what is not there"),
+            *count_note(len(self._damaged), "transform{s} {are} damaged: parts there are left out"),
         ]
         for kind, n in posed.items():
-            notes += told(n, "geometr{ies} with a {kind} {are} read in rest pose", kind=kind)
-        notes += [*told(hidden, HIDDEN), *told(nodes, ANIMATED)]
-        notes += told_missing(self._folder, filter(None, pictures))
-        return [*notes, *told(others, "more scene{s} {are} not read")]
+            notes += count_note(n, "geometr{ies} with a {kind} {are} read in rest pose", kind=kind)
+        notes += [*count_note(hidden, HIDDEN), *count_note(nodes, ANIMATED)]
+        notes += missing_note(self._folder, filter(None, pictures))
+        return [*notes, *count_note(others, "more scene{s} {are} not read")]
 
 
 def _floats(text: str | None) -> Floats:
@@ -259,7 +259,7 @@ def _turn(values: Floats) -> Floats:
     return turned
 
 
-def _look(values: Floats) -> Floats:
+def _look_at_frame(values: Floats) -> Floats:
     """Frame of a 'lookat' step: at a point, -z towards another one, y up."""
     eye, interest, up = values.reshape(3, 3)
     x = np.cross(interest - eye, up)
@@ -274,7 +274,7 @@ _STEPS: dict[str, Callable[[Floats], Floats]] = {
     "translate": lambda values: np.column_stack([np.eye(3), values]),
     "scale": lambda values: np.diag(values.reshape(3)),
     "rotate": _turn,
-    "lookat": _look,
+    "lookat": _look_at_frame,
 }
 """Upper left (n, m) of a transform (4, 4), from the numbers of a step."""
 
@@ -292,7 +292,7 @@ def _shapes(geometries: list[_Geometry]) -> tuple[list[Shape], list[str]]:
         return found, []
     first = next(iter(lost.values()))
     why = str(first) if isinstance(first, UnreadableError) else "it is damaged"
-    return found, told(len(lost), "of its geometries cannot be read: {why}", why=why)
+    return found, count_note(len(lost), "of its geometries cannot be read: {why}", why=why)
 
 
 def _shape(geometry: ET.Element, palette: _Palette) -> Shape:
@@ -326,9 +326,9 @@ def _shape(geometry: ET.Element, palette: _Palette) -> Shape:
         colours = rgba(palette[symbol]) if (symbol := piece.get("material")) in palette else None
         inputs = {kind: (at, name) for kind, (_, name) in of_vertex.items()} | inputs
         with suppress(UnreadableError, LookupError, ValueError):
-            beside, shade = inputs["COLOR"]
+            referenced_path, shade = inputs["COLOR"]
             values = _values(sources[unquote(shade)])
-            colours = rgba(mean_of_corners(values, index[:, beside][found]))
+            colours = rgba(mean_of_corners(values, index[:, referenced_path][found]))
         painted.append((colours, len(found)))
     defects = Defects(unsupported=unsupported, incomplete=incomplete)
     if not faces:

@@ -24,8 +24,7 @@ from hapticdb.mesh.formats.accessors import (
     objects_of,
     whole,
 )
-from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, of_light, rgba
-from hapticdb.mesh.formats.posing import (
+from hapticdb.mesh.formats.skinning import (
     INSTANCING,
     Pose,
     instances,
@@ -34,9 +33,8 @@ from hapticdb.mesh.formats.posing import (
     pose_of,
     positions,
 )
-from hapticdb.mesh.part import Defects
-from hapticdb.mesh.polygons import fan, strip
-from hapticdb.mesh.raw import (
+from hapticdb.mesh.formats.srgb import Colours, joined, mean_of_corners, of_light, rgba
+from hapticdb.mesh.parsed import (
     ANIMATED,
     HIDDEN,
     NameBudget,
@@ -44,11 +42,13 @@ from hapticdb.mesh.raw import (
     Placement,
     Shape,
     UnreadableError,
+    count_note,
+    missing_note,
     require,
-    told,
-    told_missing,
     walk,
 )
+from hapticdb.mesh.part import Defects
+from hapticdb.mesh.polygons import fan, strip
 from hapticdb.mesh.text import text_of
 
 _MAGIC = b"glTF"
@@ -133,12 +133,14 @@ def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]], folder:
     placed = {str(node.get("mesh")) for node in nodes}
     unplaced = sum(str(n) not in placed for n in range(len(objects_of(tree, "meshes"))))
     return [
-        *told(outside, "node{s} with a mesh {are} not in its scene and {are} left out"),
-        *told(unplaced, "mesh{es} {are} in no node and {are} left out"),
-        *told(slashed, "name{s} {hold} '/', which also separates a part's name from one above it"),
-        *told(len(moved & worlds.keys()), ANIMATED),
-        *told_missing(folder, pictures),
-        *told(hidden, HIDDEN),
+        *count_note(outside, "node{s} with a mesh {are} not in its scene and {are} left out"),
+        *count_note(unplaced, "mesh{es} {are} in no node and {are} left out"),
+        *count_note(
+            slashed, "name{s} {hold} '/', which also separates a part's name from one above it"
+        ),
+        *count_note(len(moved & worlds.keys()), ANIMATED),
+        *missing_note(folder, pictures),
+        *count_note(hidden, HIDDEN),
         *(f"its extension {name} is not read ({n}x)" for name, n in unread.items()),
     ]
 

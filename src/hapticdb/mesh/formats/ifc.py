@@ -11,11 +11,11 @@ from ifcopenshell import entity_instance
 from ifcopenshell.ifcopenshell_wrapper import triangulation
 from ifcopenshell.util.element import get_parent
 
-from hapticdb.mesh.chord import MARGIN, measured, told_coarser
-from hapticdb.mesh.formats.painting import PLAIN, rgba
-from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, told
+from hapticdb.mesh.chord import MARGIN, coarser_note, measured
+from hapticdb.mesh.formats.srgb import PLAIN, rgba
+from hapticdb.mesh.parsed import NameBudget, Parsed, Placement, Shape, count_note
 
-_LEFT_OUT = {
+_EXCLUDED = {
     "opening": ("IfcFeatureElementSubtraction",),
     "space": ("IfcSpace", "IfcSpatialZone", "IfcVirtualElement"),
 }
@@ -34,8 +34,8 @@ def read(path: Path, chord: float = _CHORD) -> Parsed:
     chord : greatest chord error of curved faces, metres.
     """
     model = ifcopenshell.open(path)
-    left_out: Counter[str] = Counter()
-    products = list(_products(model, left_out))
+    excluded: Counter[str] = Counter()
+    products = list(_products(model, excluded))
     settings = ifcopenshell.geom.settings()
     settings.set("weld-vertices", False)  # noqa: FBT003 - each face has the normals of its surface
     settings.set("mesher-linear-deflection", chord / MARGIN)
@@ -50,21 +50,21 @@ def read(path: Path, chord: float = _CHORD) -> Parsed:
     named = _named(product for product in products if product.id() in placed)
     placements = [Placement(name, *placed[number], said) for number, name, said in named]
     words = "{what}{s} {are} left out"
-    notes = [note for what, n in left_out.items() for note in told(n, words, what=what)]
+    notes = [note for what, n in excluded.items() for note in count_note(n, words, what=what)]
     words = "product{s} {are} left out: lines, or shapes that cannot be made"
-    notes += told(len(products) - len(placed), words)
+    notes += count_note(len(products) - len(placed), words)
     if _END not in path.read_bytes()[-_BYTES_OF_END:]:
         notes.append(f"it seems cut short: '{_END.decode()}' does not stand at its end")
-    notes += told_coarser(shapes, chord)
+    notes += coarser_note(shapes, chord)
     return Parsed(shapes, placements, metres=1.0, up="z", notes=notes)
 
 
-def _products(model: ifcopenshell.file, left_out: Counter[str]) -> Iterator[entity_instance]:
+def _products(model: ifcopenshell.file, excluded: Counter[str]) -> Iterator[entity_instance]:
     """Products with a shape, ascending by id; counts the omitted ones by kind."""
     for product in sorted(model.by_type("IfcProduct"), key=entity_instance.id):
-        kinds = (what for what, of in _LEFT_OUT.items() if any(map(product.is_a, of)))
+        kinds = (what for what, of in _EXCLUDED.items() if any(map(product.is_a, of)))
         if kind := next(kinds, None):
-            left_out[kind] += 1
+            excluded[kind] += 1
         elif product.Representation:
             yield product
 

@@ -11,8 +11,8 @@ import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
-from hapticdb.mesh.formats.painting import Colours
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once, told
+from hapticdb.mesh.formats.srgb import Colours
+from hapticdb.mesh.parsed import Parsed, Shape, UnreadableError, count_note, placed_once
 from hapticdb.units import length_text
 
 _MODEL, _LINEAR_UNIT, _VERTICAL_SYSTEM, _VERTICAL_UNIT = 1024, 3076, 4096, 4099
@@ -81,7 +81,7 @@ def read(path: Path) -> Parsed:
     words = "point{s} {are} withheld (deleted) in it, and {come} in like any other"
     return replace(
         parsed, likely_metres=lengths.metres, up=lengths.up, not_lengths=lengths.not_lengths,
-        notes=[*lengths.notes, *places.notes(len(whole)), *told(n_withheld, words)],
+        notes=[*lengths.notes, *places.notes(len(whole)), *count_note(n_withheld, words)],
     )  # fmt: skip
 
 
@@ -133,7 +133,7 @@ class _Places:
         stuck = np.where(is_chosen, 0, self._n_stuck.sum(axis=0))
         found = []
         for axis, n in zip("xyz", stuck.tolist(), strict=True):
-            found += told(
+            found += count_note(
                 n, "point{s} {are} stuck in {axis} at the end of 32-bit integers", axis=axis
             )
         if stuck.max() > _MOST_STUCK * n_points:

@@ -5,18 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticdb.mesh.part import Defects
-from hapticdb.mesh.polygons import triangulated
-from hapticdb.mesh.raw import (
+from hapticdb.mesh.parsed import (
     Parsed,
     Shape,
     UnreadableError,
+    count_note,
     indices,
     numbers,
     placed_once,
     positions,
-    told,
 )
+from hapticdb.mesh.part import Defects
+from hapticdb.mesh.polygons import triangulated
 from hapticdb.mesh.text import text_of
 
 _KEYWORD = re.compile(r"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
@@ -49,7 +49,7 @@ def read(path: Path) -> Parsed:
     faces, incomplete = triangulated(vertices, polygons)
     shape = Shape(vertices, faces, Defects(incomplete=incomplete))
     extra = len(body) - n_vertices - n_faces
-    notes = told(extra, "line{s} behind the last face {are} passed over")
+    notes = count_note(extra, "line{s} behind the last face {are} passed over")
     return placed_once([(path.stem, shape)], notes, "\n".join(re.findall("#.*", text)))
 
 

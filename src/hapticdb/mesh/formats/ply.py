@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.formats.painting import Colours, mean_of_corners, rgba
+from hapticdb.mesh.formats.srgb import Colours, mean_of_corners, rgba
+from hapticdb.mesh.parsed import Parsed, Shape, UnreadableError, count_note, numbers, placed_once
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import strip, triangulated, triangulated_equal
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
 from hapticdb.mesh.text import recoded
 
 Column = NDArray[Any] | list[NDArray[Any]]
@@ -72,7 +72,7 @@ def read(path: Path) -> Parsed:
         note
         for kind, table in tables.items()
         if kind not in {"vertex", "face", "tristrips"} and table
-        for note in told(len(next(iter(table.values()))), words, kind=kind)
+        for note in count_note(len(next(iter(table.values()))), words, kind=kind)
     ]
     head = content[: content.find(b"end_header")].decode("latin-1")
     return placed_once([(path.stem, shape)], notes, head)

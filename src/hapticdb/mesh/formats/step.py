@@ -8,9 +8,9 @@ import cascadio
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.chord import DEFAULT, MARGIN, measured, told_coarser
+from hapticdb.mesh.chord import DEFAULT, MARGIN, coarser_note, measured
 from hapticdb.mesh.formats import gltf
-from hapticdb.mesh.raw import Parsed, Placement, UnreadableError, told
+from hapticdb.mesh.parsed import Parsed, Placement, UnreadableError, count_note
 from hapticdb.mesh.text import text_of
 from hapticdb.units import UNITS
 
@@ -50,10 +50,10 @@ def read(path: Path, chord: float = DEFAULT) -> Parsed:
     found = _nearer(found, text, path, chord) if _is_coarse(found) else found
     shapes = [measured(shape, chord) for shape in found.shapes]
     others = len(re.findall(r"\bDOCUMENT_FILE\s*\(", text))
-    notes = told(others, "other file{s} {are} named in it, and {are} not read")
-    notes += told(len(cut), f"string{{s}} of more than {_LONGEST:,} characters {{are}} cut")
+    notes = count_note(others, "other file{s} {are} named in it, and {are} not read")
+    notes += count_note(len(cut), f"string{{s}} of more than {_LONGEST:,} characters {{are}} cut")
     notes += [] if _END in text else [_NO_END]
-    return replace(found, shapes=shapes, notes=[*found.notes, *notes, *told_coarser(shapes, chord)])
+    return replace(found, shapes=shapes, notes=[*found.notes, *notes, *coarser_note(shapes, chord)])
 
 
 def _tessellated(text: str, path: Path, chord: float) -> Parsed:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
+from hapticdb.mesh.parsed import Parsed, Shape, UnreadableError, count_note, numbers, placed_once
 from hapticdb.mesh.text import recoded, text_of
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -66,7 +66,7 @@ def _joined(content: bytes, stem: str) -> Parsed:
         solids.append((stem, _binary(content, at, n_facets)))
         at = end
     words = "byte{s} behind the last triangle {are} passed over"
-    return placed_once(solids, told(len(content) - at, words), content[:80].decode("latin-1"))
+    return placed_once(solids, count_note(len(content) - at, words), content[:80].decode("latin-1"))
 
 
 def _binary(content: bytes, at: int, n_facets: int) -> Shape:
@@ -105,7 +105,7 @@ def _text(text: str, stem: str) -> Parsed:
             solids.append((name or stem, shape))
     n_strange = len(_STRANGE.findall(text))
     words = "line{s} {begin} with unknown words and {are} passed over"
-    return placed_once(solids, told(n_strange, words))
+    return placed_once(solids, count_note(n_strange, words))
 
 
 def _facets(chunk: str, name: str) -> Shape:

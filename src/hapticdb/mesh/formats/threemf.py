@@ -21,16 +21,16 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.formats.painting import PLAIN
-from hapticdb.mesh.raw import (
+from hapticdb.mesh.formats.srgb import PLAIN
+from hapticdb.mesh.parsed import (
     NameBudget,
     Parsed,
     Placement,
     Shape,
     UnreadableError,
+    count_note,
     numbers,
     require,
-    told,
     walk,
 )
 
@@ -107,10 +107,10 @@ class _Model:
         outside = sum(
             bool(thing.indices) and key not in self.placed for key, thing in self.objects.items()
         )
-        notes = told(outside, "object{s} {are} not in its build and {are} left out")
+        notes = count_note(outside, "object{s} {are} not in its build and {are} left out")
         for kind, n in self.types.items():
             words = "object{s} {are} of the type {kind}, and {come} in like any other"
-            notes += told(n, words, kind=kind)
+            notes += count_note(n, words, kind=kind)
         for extension, elements in self.unread.items():
             most = ", ".join(f"{n} {kind}" for kind, n in elements.most_common(_MOST_KINDS))
             notes.append(f"its extension {extension} is not read: {most}")

@@ -17,21 +17,21 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
-from hapticdb.mesh.part import Defects
-from hapticdb.mesh.polygons import triangulated, triangulated_equal
-from hapticdb.mesh.raw import (
+from hapticdb.mesh.formats.srgb import Colours, joined, mean_of_corners, rgba
+from hapticdb.mesh.parsed import (
     Parsed,
     Shape,
     UnreadableError,
-    beside,
+    count_note,
     indices,
+    missing_note,
     numbers,
     placed_once,
     positions,
-    told,
-    told_missing,
+    referenced_path,
 )
+from hapticdb.mesh.part import Defects
+from hapticdb.mesh.polygons import triangulated, triangulated_equal
 from hapticdb.mesh.text import text_of
 
 _COMMENT = re.compile(r"(?<!\.)#|#(?!IND|INF|QNAN|SNAN)")  # 1.#IND is no comment
@@ -118,16 +118,16 @@ def read(path: Path) -> Parsed:
     )
     most = ", ".join(f"'{word}' {n}" for word, n in strange.most_common(_MOST_WORDS))
     words = "line{s} {begin} with unknown words and {are} passed over: {most}"
-    missing = told_missing(path.parent, pictures, *unread)
+    missing = missing_note(path.parent, pictures, *unread)
     return placed_once(
-        named, [*told(strange.total(), words, most=most), *missing], "\n".join(comments)
+        named, [*count_note(strange.total(), words, most=most), *missing], "\n".join(comments)
     )
 
 
 def _content(folder: Path, name: str) -> str | None:
     """Text of a material file in the OBJ file's own folder; None if unreadable."""
     plain = posixpath.normpath(unquote(name).replace("\\", "/"))
-    file = None if "/" in plain else beside(folder, name)
+    file = None if "/" in plain else referenced_path(folder, name)
     with suppress(OSError):
         return None if file is None else text_of(file.read_bytes()[:MOST_BYTES])
     return None

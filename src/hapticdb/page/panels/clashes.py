@@ -4,17 +4,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hapticdb.clashes.clash_results import Clash, Clashes, Shown, rule_for
 from hapticdb.clashes.groups import Group, groups_of
-from hapticdb.clashes.result import Clash, Clashes, Shown, rule_for
 from hapticdb.clashes.rules import rule_text
-from hapticdb.clashes.run import WITHIN, find_clashes
+from hapticdb.clashes.search import WITHIN, find_clashes
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
 from hapticdb.exact.separation import CONTACT
 from hapticdb.page import checks, colours
 from hapticdb.page.browser import LEAST_SHOWN, Browser
 from hapticdb.page.drawing import add_marks
-from hapticdb.page.panels.working import Progress, Work
+from hapticdb.page.panels.jobs import PanelJob, Progress
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import note_html, rows_html, short_name
 from hapticdb.units import length_text
@@ -51,9 +51,11 @@ class ClashPanel:
             gui.add_number(f"{word}, mm", 1e3 * length, min=1e-6, max=1e6, step=1e-3)
             for word, length in (("Within", WITHIN), ("Contact", CONTACT))
         )
-        look = gui.add_button("Look for clashes", hint="Measures pairs of parts that have changed.")
-        look.on_click(guard("viewer", self._look))
-        self._work = Work(browser, gui, "a search for clashes", "pairs")
+        button = gui.add_button(
+            "Look for clashes", hint="Measures pairs of parts that have changed."
+        )
+        button.on_click(guard("viewer", self._search))
+        self._work = PanelJob(browser, gui, "a search for clashes", "pairs")
         self._kind = gui.add_dropdown("Kind", (ALL, *REPORTED))
         self._status = gui.add_dropdown("Status", STATUSES)
         self._words = gui.add_text("Words", "", hint="Parts of both names, in any order.")
@@ -81,7 +83,7 @@ class ClashPanel:
             for entry in (self._within, self._contact)
         ]
 
-    def _look(self, _: object) -> None:
+    def _search(self, _: object) -> None:
         within, contact = self._lengths()
         site, may_write = self._browser.site, self._browser.visitor.may("editor")
         url = site.request.urls.get("editor", site.url) if may_write else site.url
@@ -96,7 +98,7 @@ class ClashPanel:
 
     def _show_found(self, answer: tuple[Clashes, list[Group]]) -> None:
         found, groups = answer
-        gone = [one for one in found.pairs if one.status == "gone" or one.is_left]
+        gone = [one for one in found.pairs if one.status == "gone" or one.is_unmeasured]
         self._found = found
         self._groups = [*groups, *(Group("", one.kind, None, (one,)) for one in gone)]
         self._rules.content = rows_html((rule_text(one.rule), str(one)) for one in found.reach())
@@ -191,7 +193,7 @@ class ClashPanel:
         self._end()
         browser.choose((one.a, one.b))  # the link of the view opens with this pair
         browser.scene.spotlight(dict(zip((one.a, one.b), colours.PAIR, strict=True)))
-        words = one.status if one.is_left else f"{one.kind} {one.length_text()}"
+        words = one.status if one.is_unmeasured else f"{one.kind} {one.length_text()}"
         self._drawn = add_marks(browser.client.scene, "/clash", places, words, 0.04 * radius)
         browser.scene.fly_to(places.mean(axis=0), radius)
 
@@ -211,7 +213,7 @@ class ClashPanel:
         reason = because if word == "Accept" else None
 
         def done(said: str) -> None:
-            self._browser.tell("Done", said, is_good=True)
+            self._browser.notify("Done", said, is_good=True)
             status: Shown = "accepted" if reason else "same"
             pairs = [one._replace(status=status, because=reason) for one in group.pairs]
             now = group._replace(pairs=tuple(pairs))
@@ -220,7 +222,7 @@ class ClashPanel:
             self._choose(now, 0)
 
         if edits is not None and found is not None:
-            edits.ask(
+            edits.submit(
                 self._browser.client.client_id,
                 lambda own: own.accept(group, found.known, reason), done, self._browser.failed,
             )  # fmt: skip
@@ -229,8 +231,8 @@ class ClashPanel:
         text = checks.text_of(self._rule.value, LONGEST_TEXT, "a rule")
         within, edits = self._lengths()[0], self._browser.site.edits
         if edits is not None:
-            edits.ask(
+            edits.submit(
                 self._browser.client.client_id,
                 lambda own: own.add_rule(text, within),
-                lambda said: self._browser.tell("Done", said, is_good=True), self._browser.failed,
+                lambda said: self._browser.notify("Done", said, is_good=True), self._browser.failed,
             )  # fmt: skip

@@ -12,9 +12,9 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
-from hapticdb.page.panels.moving import MovingControls
+from hapticdb.page.panels.jobs import PanelJob
+from hapticdb.page.panels.move_controls import MoveControls
 from hapticdb.page.panels.tree import PartTree
-from hapticdb.page.panels.working import Work
 from hapticdb.page.wording import note_html, rows_html, short_name, size_text
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.units import length_text
@@ -58,8 +58,8 @@ class PartsPanel:
             between.on_click(guard("viewer", lambda _: self.measure()))
             self._measures = gui.add_checkbox("Measure between two clicks", initial_value=False)
             self._measures.on_update(guard("viewer", self._start_measuring))
-            self._work = Work(browser, gui, "a measurement", "parts")
-        self.moving = MovingControls(browser, gui)
+            self._work = PanelJob(browser, gui, "a measurement", "parts")
+        self.moving = MoveControls(browser, gui)
         self._tree = PartTree(browser, gui, self._toggle)
 
     def show_objects(self) -> None:
@@ -67,20 +67,20 @@ class PartsPanel:
         self._tree.show()
         self._say_chosen()
 
-    def clicked(self, origin: Floats, way: Floats, *, adds: bool) -> None:
+    def clicked(self, origin: Floats, direction: Floats, *, adds: bool) -> None:
         """Select the first part along a ray and name it, or use the point as a distance's end."""
         browser = self._browser
-        met = browser.scene.pick(origin, way)
+        hit = browser.scene.pick(origin, direction)
         if self._measures.value:
-            if met is not None:
-                self._add_end(met.point)
-        elif met is None:
+            if hit is not None:
+                self._add_end(hit.point)
+        elif hit is None:
             self.choose(())
         else:
-            self._toggle((met.id,)) if adds else self.choose((met.id,))
+            self._toggle((hit.id,)) if adds else self.choose((hit.id,))
             self._client.scene.add_label(
-                "/named", short_name(browser.site.objects[met.id].name),
-                position=tuple(met.point), anchor="bottom-center",
+                "/named", short_name(browser.site.objects[hit.id].name),
+                position=tuple(hit.point), anchor="bottom-center",
             )  # fmt: skip
 
     def _toggle(self, ids: Sequence[int]) -> None:
@@ -138,8 +138,8 @@ class PartsPanel:
             scene.show(chosen)
         else:
             scene.hide(chosen)
-        if browser.taken is not None:
-            scene.hide((browser.taken,))
+        if browser.dragged_part is not None:
+            scene.hide((browser.dragged_part,))
         browser.filter_changed()
         self._tree.show()
 
@@ -181,7 +181,7 @@ class PartsPanel:
             if not self._voxel_box.value:
                 self._clear_voxels()
 
-        self._browser.site.database.ask(centers, draw, self._browser.failed)
+        self._browser.site.database.submit(centers, draw, self._browser.failed)
 
     def _take_out(self, _: object) -> None:
         browser = self._browser
@@ -191,20 +191,20 @@ class PartsPanel:
             return env.shell(obj.id, points=tools.PART_POINTS)
 
         def hold(found: PointShell) -> None:
-            before, browser.taken = browser.taken, obj.id
+            before, browser.dragged_part = browser.dragged_part, obj.id
             if before is not None and before != obj.id:
                 browser.scene.show((before,))
             middle = tools.middle_of(found)
-            browser.take_in_hand(
+            browser.use_tool(
                 tools.from_shell(obj.name, found), np.array([*middle, 1.0, 0.0, 0.0, 0.0])
             )
             browser.scene.hide((obj.id,))
 
-        browser.site.database.ask(shell, hold, browser.failed)
+        browser.site.database.submit(shell, hold, browser.failed)
 
     def show_tool(self) -> None:
         """Show the button "Put it back" if a part is dragged."""
-        self._back.visible = self._browser.taken is not None
+        self._back.visible = self._browser.dragged_part is not None
 
     def measure(self) -> None:
         """Measure between two chosen parts."""

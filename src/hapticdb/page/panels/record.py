@@ -128,7 +128,7 @@ class RecordPanel:
         middle = self._browser.drawing.middle
         shell = recording.header.shell
         assert self._replay is not None  # noqa: S101 - just read
-        way = self._replay.tools[:: max(1, len(self._replay.tools) // 500), :3]
+        track = self._replay.tools[:: max(1, len(self._replay.tools) // 500), :3]
         cloud = scene.add_point_cloud(
             "/replay", shell.outline, colours.TORQUE, point_size=0.004 * size,
             point_shape="circle", precision="float32",
@@ -138,8 +138,8 @@ class RecordPanel:
             head_radius=0.01 * size, head_length=0.02 * size, visible=False, position=middle,
         )  # fmt: skip
         self._drawn = [cloud, arrow]
-        if len(way) > 1:
-            segments = np.stack([way[:-1], way[1:]], axis=1) - middle
+        if len(track) > 1:
+            segments = np.stack([track[:-1], track[1:]], axis=1) - middle
             self._drawn.append(
                 scene.add_line_segments(
                     "/replay_way", segments, colours.TORQUE, thickness=2.0,

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
-from hapticdb.exact.report import gap_text, percent, verdict_line
 from hapticdb.exact.sweep import sweep
+from hapticdb.exact.sweep_report import gap_text, percent, verdict_line
 from hapticdb.exact.swept import PathPlace, Swept
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
 from hapticdb.page.drawing import add_marks, add_tool, put_at
-from hapticdb.page.panels.working import Progress, Work
+from hapticdb.page.panels.jobs import PanelJob, Progress
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import row_of_pose
@@ -28,7 +28,7 @@ MOST_NAMED = 8
 """Greatest number of listed hits."""
 COLOURS = {0: "#1f8a4c", 1: "#c62838", 3: "#a8730f", 4: "#a8730f"}
 """Colours of verdicts, by exit status."""
-WAYS = {
+DIRECTIONS = {
     "to the hand": None, "+x": (0, 1.0), "-x": (0, -1.0), "+y": (1, 1.0), "-y": (1, -1.0),
     "+z": (2, 1.0), "-z": (2, -1.0),
 }  # fmt: skip
@@ -54,12 +54,12 @@ class SweepPanel:
         self._browser = browser
         self._drawn: list[Any] = []
         guard = browser.guarded
-        gui.add_html(
-            note_html("Moves a part or the tool along a way, and says what is in its way.")
-        )
+        gui.add_html(note_html("Moves a part or the tool along a path, and says what it hits."))
         self._what = gui.add_dropdown("What", ("the chosen part", "the tool"))
-        self._way = gui.add_dropdown(
-            "Way", tuple(WAYS), initial_value=f"+{'xyz'[int(browser.site.facts.up.argmax())]}"
+        self._direction = gui.add_dropdown(
+            "Direction",
+            tuple(DIRECTIONS),
+            initial_value=f"+{'xyz'[int(browser.site.facts.up.argmax())]}",
         )
         diagonal = browser.site.facts.diagonal
         self._farthest = 10.0 * diagonal
@@ -68,19 +68,23 @@ class SweepPanel:
         )
         self._run = gui.add_button("Run the sweep")
         self._run.on_click(guard("viewer", self._begin))
-        self._work = Work(browser, gui, "a sweep", "parts near the way")
+        self._work = PanelJob(browser, gui, "a sweep", "parts near the way")
         self._clear = gui.add_button("Clear", color="gray", visible=False)
         self._clear.on_click(guard("viewer", self._clean))
 
     def _begin(self, _: object) -> None:
         browser = self._browser
         is_part = checks.choice_of(self._what.value, self._what.options, "what").endswith("part")
-        way = checks.choice_of(self._way.value, WAYS, "a way")
+        direction = checks.choice_of(self._direction.value, DIRECTIONS, "a direction")
         length = checks.number_of(self._length.value, 0.0, self._farthest, "a length")
         part = None
         if is_part:
-            part = browser.taken if browser.taken is not None else browser.only_chosen().id
-        job = _SweepJob(browser, part, way, length)
+            part = (
+                browser.dragged_part
+                if browser.dragged_part is not None
+                else browser.only_chosen().id
+            )
+        job = _SweepJob(browser, part, direction, length)
         self._work.begin(job.run, lambda found: self._show(found, job.name))
 
     def _show(self, found: _SweepAnswer, name: str) -> None:
@@ -134,16 +138,16 @@ class SweepPanel:
 
 
 class _SweepJob:
-    """Request of a sweep; part : id, None for the tool; way : key of `WAYS`; length : metres."""
+    """Request of a sweep; part : id, None for the tool; direction : a key; length : metres."""
 
-    def __init__(self, browser: Browser, part: int | None, way: str, length: float) -> None:
+    def __init__(self, browser: Browser, part: int | None, direction: str, length: float) -> None:
         self._site = browser.site
         self._part = part
-        self._way, self._length = WAYS[way], length
+        self._direction, self._length = DIRECTIONS[direction], length
         self._tool = browser.tool
         self._hand = browser.matrix_of_hand()
         self._from = browser.matrix_of_tool()
-        self._exclude = {*browser.unfelt, *(() if part is None else (part,))}
+        self._exclude = {*browser.excluded_ids, *(() if part is None else (part,))}
         obj = None if part is None else browser.site.objects[part]
         self.name = self._tool.name if obj is None else short_name(obj.name)
 
@@ -162,8 +166,8 @@ class _SweepJob:
         """Poses (2, 4, 4) of the tool, or displacements of the part from its placement."""
         first = self._from if self._part is None else np.eye(4)
         last = first.copy()
-        if self._way is not None:
-            axis, sign = self._way
+        if self._direction is not None:
+            axis, sign = self._direction
             last[axis, 3] += sign * self._length
         elif self._part is None:
             last = self._hand
@@ -172,5 +176,5 @@ class _SweepJob:
             middle[:3, 3] = tools.middle_of(shell)
             last = self._hand @ np.linalg.inv(middle)
         if math.isclose(float(np.abs(last - first).max()), 0.0, abs_tol=1e-12):
-            raise UsageError("a way of no length: give a length, or move the hand")
+            raise UsageError("a path of no length: give a length, or move the hand")
         return np.stack([first, last])

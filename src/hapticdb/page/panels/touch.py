@@ -88,12 +88,12 @@ class TouchPanel:
             return
         name = checks.choice_of(event.target.value, self._names, "a tool")
         browser.put_back()
-        browser.take_in_hand(browser.site.tools[self._names.index(name)], browser.hand)
+        browser.use_tool(browser.site.tools[self._names.index(name)], browser.hand)
 
     def _go_home(self, _: object) -> None:
         browser = self._browser
         browser.put_back()
-        browser.take_in_hand(browser.tool)
+        browser.use_tool(browser.tool)
 
     def _type_place(self, event: "GuiEvent[Any]") -> None:
         if event.client is None:  # set by the page

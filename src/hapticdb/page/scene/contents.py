@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.page.colours import colour_of
-from hapticdb.page.scene.drawings import Audience, Drawing, Sprinkle
-from hapticdb.page.scene.nodes import BatchNode, Member, Node, Sight, gathered
-from hapticdb.page.scene.picking import Struck, Targets
-from hapticdb.page.scene.rigid import taken_apart
+from hapticdb.page.scene.drawings import Audience, Drawing, PointDrawing
+from hapticdb.page.scene.nodes import Appearance, BatchNode, Member, Node, gathered
+from hapticdb.page.scene.picking import RayHit, Targets
+from hapticdb.page.scene.polar_decomposition import decompose
 from hapticdb.page.scene.shapes import PartShape
 from hapticdb.store.base import Object
 
 ALL = "all"
 """Key of the audience of all browsers."""
-MOST_LOOSE = 128
+MOST_SINGLE = 128
 """Greatest number of moved objects with a node of their own; further ones are merged anew."""
 
 
@@ -34,10 +34,10 @@ class Contents:
         self._members: dict[int, Member] = {}
         self._home: dict[int, Node] = {}
         self._targets = Targets(self._members)
-        self._audiences: dict[Hashable, tuple[Audience, Sight]] = {
+        self._audiences: dict[Hashable, tuple[Audience, Appearance]] = {
             ALL: (audience, lambda member: member.colour)
         }
-        self._shown: dict[str, Mapping[str, Drawing | Sprinkle]] = {}
+        self._shown: dict[str, Mapping[str, Drawing | PointDrawing]] = {}
         self._stale: dict[str, Node] = {}
         self._numbers = count()
         self._loose: set[int] = set()
@@ -50,7 +50,7 @@ class Contents:
             for obj in objects:
                 self.remove([obj.id])
                 self.records[obj.id] = obj
-                pose = taken_apart(obj.transform).pose
+                pose = decompose(obj.transform).pose
                 members.append(Member(obj.id, pose, obj.bounds, colour_of(obj)))
             if members:
                 self._settle([BatchNode(self._name(), members, None)])
@@ -118,7 +118,7 @@ class Contents:
     def _moved(self, member: Member) -> None:
         home = self._home[member.id]
         self._targets.changed()
-        if not home.is_cheap_to_move and member.shape and len(self._loose) < MOST_LOOSE:
+        if not home.is_cheap_to_move and member.shape and len(self._loose) < MOST_SINGLE:
             self._leave(member.id)
             self._loose.add(member.id)
             self._settle([BatchNode(self._name(), [member], member.shape)])
@@ -144,12 +144,12 @@ class Contents:
     def _name(self) -> str:
         return f"/parts/{next(self._numbers)}"
 
-    def watch(self, key: Hashable, audience: Audience, sight: Sight) -> None:
+    def watch(self, key: Hashable, audience: Audience, appearance: Appearance) -> None:
         """Add the audience of one browser."""
         with self.lock:
-            self._audiences[key] = (audience, sight)
+            self._audiences[key] = (audience, appearance)
             for node in self._nodes():
-                self._sync(node, audience, sight)
+                self._sync(node, audience, appearance)
 
     def leave(self, key: Hashable) -> None:
         """Remove a browser's audience."""
@@ -161,25 +161,27 @@ class Contents:
         with self.lock:
             if key not in self._audiences:
                 return
-            audience, sight = self._audiences[key]
+            audience, appearance = self._audiences[key]
             nodes = {self._home[i].name: self._home[i] for i in ids if i in self._home}
             for node in nodes.values():
-                self._sync(node, audience, sight)
+                self._sync(node, audience, appearance)
 
     def refresh(self) -> None:
         """Redraw changed nodes for all audiences."""
         with self.lock:
             stale, self._stale = self._stale, {}
             for node in stale.values():
-                for audience, sight in self._audiences.values():
-                    self._sync(node, audience, sight)
+                for audience, appearance in self._audiences.values():
+                    self._sync(node, audience, appearance)
 
     def _nodes(self) -> list[Node]:
         return list({node.name: node for node in self._home.values()}.values())
 
-    def _sync(self, node: Node, audience: Audience, sight: Sight) -> None:
+    def _sync(self, node: Node, audience: Audience, appearance: Appearance) -> None:
         """Update an audience's scene nodes to its view of a node's objects."""
-        wanted: Mapping[str, Drawing | Sprinkle] = node.drawings(sight) if node.members else {}
+        wanted: Mapping[str, Drawing | PointDrawing] = (
+            node.drawings(appearance) if node.members else {}
+        )
         if audience is self._audiences[ALL][0]:
             before = self._shown.pop(node.name, {})
             for name in before.keys() - wanted.keys():
@@ -201,7 +203,7 @@ class Contents:
 
     def pick(
         self, origin: ArrayLike, direction: ArrayLike, sees: Callable[[int], bool]
-    ) -> Struck | None:
+    ) -> RayHit | None:
         """Nearest object along a ray, world frame, among those of `sees`; None without a hit."""
         with self.lock:
             return self._targets.first(origin, direction, sees)
@@ -228,7 +230,7 @@ def is_same_shape(one: Object, other: Object) -> bool:
     return (
         one.digest == other.digest
         and one.link == other.link
-        and taken_apart(one.transform).key == taken_apart(other.transform).key
+        and decompose(one.transform).key == decompose(other.transform).key
     )
 
 
@@ -236,7 +238,7 @@ def motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[n
     """Rigid motion (4, 4), world frame, between two placements of equal stretch."""
     if np.array_equal(before, after):
         return np.eye(4)
-    start, end = taken_apart(before).pose, taken_apart(after).pose
+    start, end = decompose(before).pose, decompose(after).pose
     back = np.eye(4)
     back[:3, :3] = start[:3, :3].T
     back[:3, 3] = -back[:3, :3] @ start[:3, 3]

@@ -65,7 +65,7 @@ class Drawing:
         """Key of the geometry."""
         return self.geometry.key
 
-    def equals(self, other: "Drawing | Sprinkle") -> bool:
+    def equals(self, other: "Drawing | PointDrawing") -> bool:
         """Whether both are equal in the scene."""
         return (
             isinstance(other, Drawing)
@@ -83,7 +83,7 @@ class Drawing:
 
 
 @dataclass(frozen=True, eq=False)
-class Sprinkle:
+class PointDrawing:
     """A node of points: wxyz (4,), position (3,), metres; colour : None for the points' own."""
 
     key: Hashable
@@ -92,10 +92,10 @@ class Sprinkle:
     position: NDArray[np.float64]
     colour: Colour | None
 
-    def equals(self, other: "Drawing | Sprinkle") -> bool:
+    def equals(self, other: "Drawing | PointDrawing") -> bool:
         """Whether both are equal in the scene."""
         return (
-            isinstance(other, Sprinkle)
+            isinstance(other, PointDrawing)
             and (self.key, self.colour) == (other.key, other.colour)
             and np.array_equal(self.position, other.position)
             and np.array_equal(self.wxyz, other.wxyz)
@@ -115,7 +115,7 @@ class Audience:
         """Names of the nodes."""
         return self._meshes.keys() | self._blanks.keys()
 
-    def put(self, name: str, drawing: Drawing | Sprinkle) -> None:
+    def put(self, name: str, drawing: Drawing | PointDrawing) -> None:
         """Set a node's drawing; geometry is sent only if its key changes."""
         blank = self._blanks.pop(name, None)
         if blank is not None:
@@ -125,7 +125,7 @@ class Audience:
             self._meshes[name] = (drawing.key, self._added(name, drawing))
             return
         mesh = there[1]
-        if isinstance(drawing, Sprinkle):
+        if isinstance(drawing, PointDrawing):
             mesh.wxyz, mesh.position = drawing.wxyz, drawing.position
             shades = drawing.dots.colours if drawing.colour is None else np.array(drawing.colour)
             cast("PointCloudHandle", mesh).colors = shades.astype(np.uint8)
@@ -141,10 +141,10 @@ class Audience:
                 setattr(mesh, prop, value)
 
     def _added(
-        self, name: str, drawing: Drawing | Sprinkle
+        self, name: str, drawing: Drawing | PointDrawing
     ) -> "BatchedMeshHandle | PointCloudHandle":
-        if isinstance(drawing, Sprinkle):
-            return self._sprinkled(name, drawing)
+        if isinstance(drawing, PointDrawing):
+            return self._with_points(name, drawing)
         vertices, faces = drawing.geometry.make()
         middle = drawing.positions.mean(axis=0)  # viser sends float32
         return self._scene.add_batched_meshes_simple(
@@ -163,7 +163,7 @@ class Audience:
             position=middle,
         )
 
-    def _sprinkled(self, name: str, drawing: Sprinkle) -> "PointCloudHandle":
+    def _with_points(self, name: str, drawing: PointDrawing) -> "PointCloudHandle":
         points, colours, size = drawing.dots
         return self._scene.add_point_cloud(
             name,

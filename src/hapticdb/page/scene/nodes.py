@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.page.colours import Colour, Rgba
-from hapticdb.page.scene.drawings import Drawing, Geometry, Sprinkle
+from hapticdb.page.scene.drawings import Drawing, Geometry, PointDrawing
 from hapticdb.page.scene.facets import Facets, cube
 from hapticdb.page.scene.shapes import Dots, PartShape, Piece
 from hapticdb.poses import quaternion_of
@@ -38,7 +38,7 @@ class Member:
     shape: PartShape | None = None
 
 
-Sight = Callable[[Member], Colour | Rgba | None]
+Appearance = Callable[[Member], Colour | Rgba | None]
 """Colour of an object for an audience, with an opacity if transparent; None if hidden."""
 
 
@@ -67,9 +67,9 @@ class BatchNode:
         """Whether a move sends few bytes: all poses of the node, 28 bytes each."""
         return self._is_boxes or len(self._slots) <= 256
 
-    def drawings(self, sight: Sight) -> dict[str, Drawing]:
+    def drawings(self, appearance: Appearance) -> dict[str, Drawing]:
         """A drawing for each piece of the shape and each opacity; hidden objects have size 0."""
-        colours = [sight(one) if one.id in self.members else None for one in self._slots]
+        colours = [appearance(one) if one.id in self.members else None for one in self._slots]
         opacities = np.array([(*colour, _OPAQUE)[3] if colour else -1 for colour in colours])
         for slot, member in enumerate(self._slots):
             if member.id not in self.members:
@@ -108,15 +108,15 @@ class _CloudNode:
         self.members = {member.id: member}
         self._serial, self._dots = shape.serial, dots
 
-    def drawings(self, sight: Sight) -> dict[str, Sprinkle]:
+    def drawings(self, appearance: Appearance) -> dict[str, PointDrawing]:
         """The only drawing."""
         (member,) = self.members.values()
-        colour = sight(member)
+        colour = appearance(member)
         if colour is None:
             return {}
         wxyz, at = quaternion_of(member.pose[None, :3, :3])[0], member.pose[:3, 3].copy()
         own = None if colour == member.colour else colour[:3]
-        return {self.name: Sprinkle(self._serial, self._dots, wxyz, at, own)}
+        return {self.name: PointDrawing(self._serial, self._dots, wxyz, at, own)}
 
 
 def _geometry_of(key: Hashable, piece: Piece, radius: float) -> Geometry:
@@ -149,11 +149,11 @@ class _MergedNode:
         self._low, self._high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         self._center = (self._low + self._high) / 2
 
-    def drawings(self, sight: Sight) -> dict[str, Drawing]:
+    def drawings(self, appearance: Appearance) -> dict[str, Drawing]:
         """A drawing for the node's own colour, and one for each other colour."""
         of_colour: dict[tuple[str, Rgba], list[tuple[Member, int]]] = {}
         for member in self.members.values():
-            colour = sight(member)
+            colour = appearance(member)
             if colour is None or member.shape is None:
                 continue
             for n, piece in enumerate(member.shape.pieces):

@@ -10,7 +10,7 @@ from hapticdb.page.scene.nodes import Member
 
 
 @dataclass(frozen=True)
-class Struck:
+class RayHit:
     """Hit of a ray: point (3,), world frame, and distance from the ray's origin; metres."""
 
     id: int
@@ -31,54 +31,54 @@ class Targets:
 
     def first(
         self, origin: ArrayLike, direction: ArrayLike, sees: Callable[[int], bool]
-    ) -> Struck | None:
+    ) -> RayHit | None:
         """Nearest object along a ray among those of `sees`; None without a hit.
 
         Broad phase: AABBs in the order of the ray's entry, up to the nearest hit of the narrow
         phase.
         """
         start = np.asarray(origin, dtype=np.float64)
-        way = np.asarray(direction, dtype=np.float64)
-        way = way / np.linalg.norm(way)
+        ray = np.asarray(direction, dtype=np.float64)
+        ray = ray / np.linalg.norm(ray)
         ids = list(self._members)
         if self._boxes is None:
             self._boxes = np.array([one.box for one in self._members.values()]).reshape(-1, 2, 3)
-        enters, leaves = _slabs(self._boxes, start, way)
-        met = np.flatnonzero((enters <= leaves) & (leaves >= 0))
+        enters, leaves = _slabs(self._boxes, start, ray)
+        candidates = np.flatnonzero((enters <= leaves) & (leaves >= 0))
         nearest: tuple[float, int] | None = None
-        for row in met[np.argsort(enters[met])].tolist():
+        for row in candidates[np.argsort(enters[candidates])].tolist():
             if nearest is not None and enters[row] > nearest[0]:
                 break
             object_id = ids[row]
             if not sees(object_id):
                 continue
-            found = _met(self._members[object_id], start, way, float(enters[row]))
+            found = _hit_distance(self._members[object_id], start, ray, float(enters[row]))
             if found is not None and (nearest is None or found < nearest[0]):
                 nearest = (found, object_id)
         if nearest is None:
             return None
         distance, object_id = nearest
-        return Struck(object_id, start + distance * way, distance)
+        return RayHit(object_id, start + distance * ray, distance)
 
 
 def _slabs(
-    boxes: NDArray[np.float64], start: NDArray[np.float64], way: NDArray[np.float64]
+    boxes: NDArray[np.float64], start: NDArray[np.float64], ray: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Slab test: entry and exit distances (n,) of AABBs (n, 2, 3), enlarged by rounding errors."""
     room = 1e-9 * (np.abs(boxes).max(axis=(1, 2)) + np.abs(start).max())
     with np.errstate(divide="ignore", invalid="ignore"):
-        one = (boxes[:, 0] - room[:, None] - start) / way
-        other = (boxes[:, 1] + room[:, None] - start) / way
+        one = (boxes[:, 0] - room[:, None] - start) / ray
+        other = (boxes[:, 1] + room[:, None] - start) / ray
     enters = np.fmax.reduce(np.fmin(one, other), axis=1)
     leaves = np.fmin.reduce(np.fmax(one, other), axis=1)
     return np.maximum(enters, 0.0), leaves
 
 
-def _met(
-    target: Member, start: NDArray[np.float64], way: NDArray[np.float64], enters: float
+def _hit_distance(
+    target: Member, start: NDArray[np.float64], ray: NDArray[np.float64], enters: float
 ) -> float | None:
     """Distance to an object, metres; None without a hit."""
     if target.shape is None:
         return enters
     turn = target.pose[:3, :3]
-    return target.shape.first_hit(turn.T @ (start - target.pose[:3, 3]), turn.T @ way)
+    return target.shape.first_hit(turn.T @ (start - target.pose[:3, 3]), turn.T @ ray)

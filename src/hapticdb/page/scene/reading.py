@@ -14,7 +14,7 @@ from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh import Part
 from hapticdb.page.colours import by_height
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
-from hapticdb.page.scene.rigid import taken_apart
+from hapticdb.page.scene.polar_decomposition import decompose
 from hapticdb.page.scene.shapes import Dots, PartShape, draw_each
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
@@ -103,7 +103,7 @@ class ShapeReader:
 
     def _shaped(self, obj: Object, part: Part) -> ShapedObject:
         """Object, shape and pose; equal parts of equal stretch share a shape."""
-        placed = taken_apart(obj.transform)
+        placed = decompose(obj.transform)
         if part.faces is None:
             cloud = _cloud(obj, part)
             return obj, cloud, centred(np.eye(4), cloud)

@@ -47,10 +47,10 @@ def framing(box: NDArray[np.float64], up: int, reach: float = 0.0) -> View:
     """View of an AABB (2, 3) and of a sphere of radius `reach` about its centre, metres."""
     center = box.mean(axis=0)
     radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, reach, 1e-9)
-    way = np.zeros(3)
-    way[[(up + 1) % 3, (up + 2) % 3, up]] = TOWARDS
-    way /= np.linalg.norm(way)
-    return View(center + way * radius / np.sin(FIELD_OF_VIEW / 2), center)
+    toward = np.zeros(3)
+    toward[[(up + 1) % 3, (up + 2) % 3, up]] = TOWARDS
+    toward /= np.linalg.norm(toward)
+    return View(center + toward * radius / np.sin(FIELD_OF_VIEW / 2), center)
 
 
 def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
 from hapticdb.grid import Grid
+from hapticdb.page.scene.commit_follower import Follower
 from hapticdb.page.scene.contents import Contents, is_same_shape
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
-from hapticdb.page.scene.following import Follower
 from hapticdb.page.scene.reading import MOST_BLOCKS, ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
 from hapticdb.page.scene.surroundings import add_surroundings

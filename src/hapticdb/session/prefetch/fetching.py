@@ -41,7 +41,7 @@ IDLE = 1e-3
 MOST_IDLE = 1e-2
 """Greatest pause (s): a pause lasts as long as its round, within these bounds. Larger: with many
 sessions loops get more of the processor, and a moving hand is noticed later."""
-ASK_EVERY = 5e-3
+POLL_EVERY = 5e-3
 """Seconds between queries for the objects in contact. Larger: names come later."""
 CONFIRM_EVERY = 0.05
 """Seconds between queries for the revision. A store reports commits without a round trip, so only a
@@ -100,7 +100,7 @@ class Fetcher:
             raise
         self._answers = ObjectAnswers(self.table, self.residency)
         self._now = clock()
-        self._asked_at = self._released_at = self._now
+        self._queried_at = self._released_at = self._now
         self._confirmed_at = -np.inf
         self._is_confirmed = False
         self._version_seen = -1
@@ -125,9 +125,9 @@ class Fetcher:
     def warm_up(self) -> None:
         """Run all steps of a round once, on one cell, so no later round compiles a kernel."""
         grid = self.request.grid
-        told = np.zeros((), PREFETCH_REQUEST)
-        told["tool"] = told["handle"] = grid.origin
-        request = PrefetchRequest.of_record(grid, told, LOOKAHEAD, 0.0)
+        record = np.zeros((), PREFETCH_REQUEST)
+        record["tool"] = record["handle"] = grid.origin
+        request = PrefetchRequest.of_record(grid, record, LOOKAHEAD, 0.0)
         assert request is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(request.cells(grid)[0][:1]))
         self.residency.warm_up()
@@ -149,8 +149,8 @@ class Fetcher:
             self._is_confirmed = True
             self._answers.forget()
         is_busy = self._bring_in(self._now - before)
-        if self._now - self._asked_at >= ASK_EVERY:
-            self._asked_at = self._now
+        if self._now - self._queried_at >= POLL_EVERY:
+            self._queried_at = self._now
             self._answers.answer(self.store, self.tracker.sessions)
         if self._now - self._released_at >= RELEASE_EVERY:
             self._released_at = self._now
@@ -187,7 +187,7 @@ class Fetcher:
         has_moved = self.tracker.read_queue(elapsed, self.lookahead)
         missing = NO_KEYS
         has_new_cells = self._version_seen != self.table.version
-        if has_moved or has_new_cells or self.tracker.has_met_unknown_cells():
+        if has_moved or has_new_cells or self.tracker.has_unknown_cells():
             self._version_seen = self.table.version
             missing = self.tracker.missing_cells(self.residency)
         self.tracker.report_missing()
@@ -238,7 +238,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
     table = request.table
     is_first = table.version == FIRST_VERSION
     fetcher: Fetcher | None = None
-    patience, at_most = RETRY
+    timeout, at_most = RETRY
     is_lost = is_ready = False
     while not table.cells.control["is_over"] and not parent_is_gone():
         try:
@@ -256,7 +256,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
             if not is_busy:
                 # with many sessions a round takes long: half the processor is left to their loops
                 time.sleep(max(IDLE, min(took, MOST_IDLE)))
-            is_lost, is_ready, patience = False, True, RETRY[0]
+            is_lost, is_ready, timeout = False, True, RETRY[0]
         except (GridError, UsageError):
             raise
         except (HapticDBError, OSError) as error:
@@ -268,7 +268,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
                 if fetcher is not None:
                     table.queue.figures["losses"] += 1
             is_lost = True
-            time.sleep(patience)
-            patience = min(2 * patience, at_most)
+            time.sleep(timeout)
+            timeout = min(2 * timeout, at_most)
     if fetcher is not None:
         fetcher.close()

@@ -28,7 +28,7 @@ from hapticdb.store.urls import redact
 
 FETCH = "hapticdb.session.prefetch.fetching:fetch"
 """Function of a prefetch process."""
-END_PATIENCE = 0.5
+END_TIMEOUT = 0.5
 """Seconds until a prefetch process is killed at its end; a hung database may delay it. It only
 reads, so it may be killed at any time."""
 RESTART_EVERY = 1.0
@@ -106,7 +106,7 @@ class ResidentCells(Closes):
     ----------
     filter : Filter
         The words of `where` and `exclude`.
-    first_objects, left_out : tuple
+    first_objects, excluded : tuple
         All objects when the cells were made, and the ids of those that were not felt.
     """
 
@@ -156,15 +156,15 @@ class ResidentCells(Closes):
         try:
             check_cells(store)
             self.first_objects = tuple(store.objects())
-            left_out = self.filter.left_out(self.first_objects, store.url)
-            for error in left_out.missing:
+            excluded = self.filter.excluded(self.first_objects, store.url)
+            for error in excluded.missing:
                 raise error
             if distances:
-                check_distances(store, left_out.ids)
-            self.left_out: tuple[int, ...] = tuple(left_out.ids.tolist())
-            ids = set(self.left_out)
-            felt = [obj for obj in self.first_objects if obj.id not in ids]
-            has_all = all(obj.has_distances for obj in felt)
+                check_distances(store, excluded.ids)
+            self.excluded: tuple[int, ...] = tuple(excluded.ids.tolist())
+            ids = set(self.excluded)
+            selected = [obj for obj in self.first_objects if obj.id not in ids]
+            has_all = all(obj.has_distances for obj in selected)
             return store.grid, has_all if distances is None else distances
         finally:
             store.close()
@@ -236,13 +236,13 @@ class ResidentCells(Closes):
         """Figures of the prefetch process so far."""
         counted = self.table.queue.figures
         shared = set(CacheFigures._fields) & set(FIGURES.names or ())
-        told = {name: counted[name].item() for name in shared}
+        values = {name: counted[name].item() for name in shared}
         wanted = counted["wanted"].item()
-        return CacheFigures(**told | {
+        return CacheFigures(**values | {
             "budget_bytes": self.table.size_bytes,
             "hit_rate": counted["granted"].item() / wanted if wanted else 1.0,
             "restarts": self.restarts,
-            "lag": None if math.isnan(told["lag"]) else told["lag"],
+            "lag": None if math.isnan(values["lag"]) else values["lag"],
         })  # fmt: skip
 
     def header(
@@ -268,5 +268,5 @@ class ResidentCells(Closes):
             return
         self.table.cells.control["is_over"] = 1
         with self._supervising:
-            self._process.end(END_PATIENCE)
+            self._process.end(END_TIMEOUT)
             self.table.close()

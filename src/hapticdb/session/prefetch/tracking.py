@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import CELL_BITS, Grid
-from hapticdb.kernels.field.law import ONSET
-from hapticdb.kernels.records.cells import MOST_ASKED
+from hapticdb.kernels.field.distance_law import ONSET
+from hapticdb.kernels.records.cells import MOST_OBJECT_REQUESTS
 from hapticdb.kernels.resident.cell_table import cells_ahead
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
 from hapticdb.resident.residency import Residency
@@ -62,17 +62,17 @@ class PrefetchRequest(NamedTuple):
 
     @classmethod
     def of_record(
-        cls, grid: Grid, told: NDArray[np.void], lookahead: float, peak_speed: float
+        cls, grid: Grid, record: NDArray[np.void], lookahead: float, peak_speed: float
     ) -> "PrefetchRequest | None":
         """Request of a session; None unless all numbers of its tool are finite.
 
-        told () : of `PREFETCH_REQUEST`. The bounding sphere moves from the tool to the hand, and on
-        with the hand's velocity for `lookahead` seconds. The margin is the greatest distance of the
-        hand from this path after this time, at 1.5 times its recent `peak_speed` (m/s), at
+        record () : of `PREFETCH_REQUEST`. The bounding sphere moves from the tool to the hand, and
+        on with the hand's velocity for `lookahead` seconds. The margin is the greatest distance of
+        the hand from this path after this time, at 1.5 times its recent `peak_speed` (m/s), at
         `REACH_VOXELS` at least.
         """
-        tool, handle, velocity = told["tool"], told["handle"], told["velocity"]
-        radius, size = float(told["radius"]), grid.voxel_size
+        tool, handle, velocity = record["tool"], record["handle"], record["velocity"]
+        radius, size = float(record["radius"]), grid.voxel_size
         if not np.isfinite([*tool, *handle, *velocity, radius]).all():
             return None
         margin = max(1.5 * peak_speed / size, REACH_VOXELS) * lookahead
@@ -163,13 +163,13 @@ class SessionTracker:
         has_moved = active != set(self.sessions)
         self.sessions = {row: self.sessions.get(row, _TrackedSession()) for row in sorted(active)}
         for row, session in self.sessions.items():
-            told = self._read_told(row, session)
-            if told is None:
+            record = self._read_report(row, session)
+            if record is None:
                 continue
-            speed = float(np.linalg.norm(told["velocity"]))
+            speed = float(np.linalg.norm(record["velocity"]))
             if np.isfinite(speed):
                 session.speed = max(speed, session.speed * 0.5 ** (elapsed / SPEED_HALF_LIFE))
-            request = PrefetchRequest.of_record(self._grid, told, lookahead, session.speed)
+            request = PrefetchRequest.of_record(self._grid, record, lookahead, session.speed)
             if request is None or (
                 session.request is not None and request.is_near(session.request)
             ):
@@ -179,17 +179,17 @@ class SessionTracker:
             has_moved = True
         return has_moved
 
-    def _read_told(self, row: int, session: _TrackedSession) -> NDArray[np.void] | None:
+    def _read_report(self, row: int, session: _TrackedSession) -> NDArray[np.void] | None:
         """Read a row of the queue completely; None if its loop died while it wrote the row."""
         queue = self._table.queue.requests
         for _ in range(READ_ATTEMPTS):
             session.sequence = int(queue["sequence"][row])
-            told: NDArray[np.void] = queue["prefetch"][row, ...].copy()
+            record: NDArray[np.void] = queue["prefetch"][row, ...].copy()
             if session.sequence % 2 == 0 and session.sequence == queue["sequence"][row]:
-                return told
+                return record
         return None
 
-    def has_met_unknown_cells(self) -> bool:
+    def has_unknown_cells(self) -> bool:
         """Whether any session's last frame had unknown cells."""
         return bool(self._table.queue.requests["missed"]["n_cells"][list(self.sessions)].any())
 
@@ -270,7 +270,7 @@ class ObjectAnswers:
             keys = np.unique(self._queue["asked"][row, :n_asked])
             question = keys.tobytes()
             if before.get(row) != question:
-                ids = self.ids_of(store, keys)[:MOST_ASKED]
+                ids = self.ids_of(store, keys)[:MOST_OBJECT_REQUESTS]
                 self._queue["objects"][row, : len(ids)] = ids
                 self._queue["n_objects"][row] = len(ids)
             self._answered[row] = question

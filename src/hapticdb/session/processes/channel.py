@@ -34,7 +34,7 @@ class Channel:
 
     def __init__(self, sock: socket.socket) -> None:
         self.sock = sock
-        self._asking = threading.Lock()
+        self._requesting = threading.Lock()
 
     def send(self, content: object, descriptors: Sequence[int] = ()) -> None:
         """Send a message, and file descriptors with it."""
@@ -50,12 +50,12 @@ class Channel:
         packed = self._receive_exactly(int.from_bytes(header, "little"))
         return pickle.loads(packed), descriptors  # noqa: S301 - from a process of our own
 
-    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
+    def call(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
         """Send a request and return the answer of the other process; one request at a time.
 
         Raises the other process's error, or `HapticDBError` if it has ended or does not answer.
         """
-        with self._asking:
+        with self._requesting:
             try:
                 self.send(Message(word, content), descriptors)
                 answer, _ = self.receive()
@@ -75,15 +75,15 @@ class Channel:
         request's descriptors are closed afterwards. Raises EOFError or OSError only if the other
         process has closed its end, or has died.
         """
-        asked, descriptors = self.receive()
+        request, descriptors = self.receive()
         try:
-            answer = Message("done", do(asked, descriptors))
+            answer = Message("done", do(request, descriptors))
         except HapticDBError as error:
             answer = Message("error", error)
         except Exception:
-            LOG.exception("a request failed: %s", asked.word)
-            told = "the host failed at this request: its log says why; try again"
-            answer = Message("error", HapticDBError(told))
+            LOG.exception("a request failed: %s", request.word)
+            message = "the host failed at this request: its log says why; try again"
+            answer = Message("error", HapticDBError(message))
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)

@@ -27,7 +27,7 @@ from typing import NamedTuple
 from hapticdb.errors import HapticDBError
 from hapticdb.session.processes.channel import Channel
 
-ANSWER_PATIENCE = 300.0
+ANSWER_TIMEOUT = 300.0
 """Seconds for the server's answer: it may load numba and compile. Larger: a caller waits longer for
 a hung server."""
 
@@ -68,7 +68,7 @@ class _ForkServer:
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
-        ours.settimeout(ANSWER_PATIENCE)
+        ours.settimeout(ANSWER_TIMEOUT)
         self.channel = Channel(ours)
         call = f"from {__name__} import serve; serve({theirs.fileno()}, {os.getpid()})"
         with theirs:
@@ -160,7 +160,7 @@ def _answered(wanted: Order, descriptors: Sequence[int]) -> tuple[int, list[int]
             except TimeoutError as error:
                 _end()
                 raise HapticDBError(
-                    f"no process was started in {ANSWER_PATIENCE:g} s: this machine is too slow now"
+                    f"no process was started in {ANSWER_TIMEOUT:g} s: this machine is too slow now"
                 ) from error
             except (ConnectionError, EOFError) as error:
                 _end()

@@ -20,13 +20,13 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.session.processes.channel import Channel, Message
 from hapticdb.session.processes.fork_server import start
 
-END_PATIENCE = 5.0
+END_TIMEOUT = 5.0
 """Seconds for a process to end by itself before it is killed. Larger: slower devices can close, a
 hung process delays the end longer."""
-START_PATIENCE = 120.0
+START_TIMEOUT = 120.0
 """Seconds until a process must be ready: a device may take long to open. Larger: a caller waits
 longer for a hung process."""
-LOOK_EVERY = 0.25
+POLL_EVERY = 0.25
 """Seconds between two checks of a process for its parent."""
 _ends = select.poll()
 """Becomes readable when the parent has ended, or has closed its channel."""
@@ -94,7 +94,7 @@ class Process:
     def await_ready(self, name: str) -> Any:  # noqa: ANN401 - what was sent
         """Content of the first message; without one the process is ended, and an error raised."""
         try:
-            ready, is_slow = self.receive(START_PATIENCE), self.is_alive
+            ready, is_slow = self.receive(START_TIMEOUT), self.is_alive
         except BaseException:
             self.end()
             raise
@@ -102,7 +102,7 @@ class Process:
             return ready.content
         self.end()
         raise HapticDBError(
-            f"the {name} process was not ready after {START_PATIENCE:g} s: the database or this "
+            f"the {name} process was not ready after {START_TIMEOUT:g} s: the database or this "
             "machine is too slow now; try again"
             if is_slow
             else f"the {name} process did not start: its errors are above"
@@ -119,13 +119,13 @@ class Process:
         ended.register(self._standing, select.POLLIN)
         return bool(ended.poll(1000.0 * seconds))
 
-    def end(self, patience: float = END_PATIENCE) -> None:
-        """End the process: close its channel, and kill it if it runs `patience` s later."""
+    def end(self, timeout: float = END_TIMEOUT) -> None:
+        """End the process: close its channel, and kill it if it runs `timeout` s later."""
         self._channel.close()
-        if not self.wait(patience):
+        if not self.wait(timeout):
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._standing, signal.SIGKILL)
-            self.wait(END_PATIENCE)
+            self.wait(END_TIMEOUT)
 
 
 class _EndQuietly(SystemExit):

@@ -19,7 +19,7 @@ from hapticdb.errors import AccessError, EnvironmentExistsError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, row_shift
 from hapticdb.store.postgres.address import Address, partition_addresses
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 
 CELL_BITS = 15
 """Bits of a voxel's key within its cell."""
@@ -45,7 +45,7 @@ SELECT DISTINCT srvname::text
   FROM pg_foreign_table JOIN pg_class ON pg_class.oid = ftrelid
   JOIN pg_foreign_server ON pg_foreign_server.oid = ftserver
  WHERE relnamespace = quote_ident(%s)::regnamespace AND srvname LIKE %s"""
-"""Foreign servers of an environment, from `spread`."""
+"""Foreign servers of an environment, from `create_partitions`."""
 
 
 def ends(grid: Grid, layout: Layout, n: int) -> list[int]:
@@ -68,7 +68,7 @@ def _statements(table: Layout) -> list[str]:
     return found[1].split(";")[:-1]
 
 
-def spread(
+def create_partitions(
     address: Address,
     connect: Callable[[Address], ServerConnection],
     grid: Grid,

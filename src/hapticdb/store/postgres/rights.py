@@ -9,7 +9,7 @@ from psycopg import sql
 from hapticdb.errors import AccessError, UsageError
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import check_name
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 
 WITHDRAWN = (
     "REVOKE ALL ON SCHEMA {schema} FROM {role}",

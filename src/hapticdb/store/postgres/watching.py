@@ -4,7 +4,7 @@ Each write notifies the environment's channel in its own transaction (PostgreSQL
 Checking for a received notification costs no round trip. Any role of the database may send one: it
 is only a hint to poll the revision, and only editors can raise that.
 
-The revision is also polled without a hint, every `HEARING_S` or `DEAF_S`: for servers without
+The revision is also polled without a hint, every `LISTENING_S` or `POLLING_S`: for servers without
 LISTEN, such as standbys, for writers without NOTIFY, and for an environment dropped and created
 anew, with another oid of its table.
 """
@@ -17,14 +17,14 @@ from psycopg import sql
 
 from hapticdb.store.postgres.address import LONGEST_NAME
 from hapticdb.store.postgres.connecting import failures, wire
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 
 REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
 """Hex digits of the digest in place of a long name. Fewer: equal channels become possible."""
-HEARING_S = 1.0
+LISTENING_S = 1.0
 """Longest delay of a commit without a notification, where LISTEN works, s."""
-DEAF_S = 0.02
+POLLING_S = 0.02
 """Longest delay of a commit where LISTEN does not work, s."""
 HINTED_S = 0.005
 """Shortest time between two hinted round trips, s: 200 a second under forged notifications."""
@@ -49,9 +49,9 @@ class Watch:
         self._connection = connection
         self._identity = identity
         self._listening_on: psycopg.Connection[tuple[object, ...]] | None = None
-        self.revision = self._told = -1
+        self.revision = self._reported = -1
         self._is_hinted = False
-        self._is_deaf = True
+        self._is_polling = True
         self._due = self._asked = 0.0
 
     def begin(self, *, is_prompt: bool = False) -> None:
@@ -59,59 +59,59 @@ class Watch:
         self._connection.check_outside()
         self._connection.is_prompt = is_prompt
         self._connection.again(self._listen)
-        self._ask()
-        self._told = self.revision
+        self._query_revision()
+        self._reported = self.revision
 
     def has_changed(self) -> bool:
         """Whether something was committed since `begin` or the last call.
 
-        Costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one, and
+        Costs a round trip after a notification, after `LISTENING_S` or `POLLING_S` without one, and
         after a lost connection; then true, because notifications may have been missed. Raises
         ConnectionLostError when the environment was recreated.
         """
         self._connection.check_outside()
-        self.look(HINTED_S)
-        before, self._told = self._told, self.revision
-        return before != self._told
+        self.poll(HINTED_S)
+        before, self._reported = self._reported, self.revision
+        return before != self._reported
 
-    def look(self, pause: float = 0.0) -> bool:
+    def poll(self, pause: float = 0.0) -> bool:
         """Poll `revision` if it may have changed; returns whether it was polled.
 
         pause : shortest time between two hinted round trips, s.
         """
         if self._connection.again(self._listen):
-            self._told = -1
+            self._reported = -1
         else:
             now = time.monotonic()
             is_hinted = self._is_hinted and now >= self._asked + pause
             if not is_hinted and now < self._due:
                 return False
-        self._ask()
+        self._query_revision()
         return True
 
     def _listen(self) -> bool:
         """Receive notifications, or LISTEN on a new connection; returns whether it is new."""
         driver = self._connection.driver
         if driver is self._listening_on:
-            self._connection.hear()
+            self._connection.receive_notifications()
             return False
-        driver.add_notify_handler(self._hear)
+        driver.add_notify_handler(self._on_notification)
         channel = sql.Identifier(channel_of(self._connection.address.environment))
         try:
             self._connection.command(f"LISTEN {channel.as_string(driver)}")
-            self._is_deaf = False
+            self._is_polling = False
         except psycopg.Error as error:
             if failures.is_lost(error):
                 raise
-            self._is_deaf = True
+            self._is_polling = True
         self._listening_on = driver
         self._due = 0.0  # if the following query fails, the next call repeats it
         return True
 
-    def _hear(self, _: psycopg.Notify) -> None:
+    def _on_notification(self, _: psycopg.Notify) -> None:
         self._is_hinted = True
 
-    def _ask(self) -> None:
+    def _query_revision(self) -> None:
         # cleared before the query: a commit after its result sets it again
         self._is_hinted = False
         found, identity = self._connection.fetch(REVISION)
@@ -119,4 +119,4 @@ class Watch:
             raise failures.remade(self._connection.shown)
         self.revision = wire.read_int8(found or b"")
         self._asked = time.monotonic()
-        self._due = self._asked + (DEAF_S if self._is_deaf else HEARING_S)
+        self._due = self._asked + (POLLING_S if self._is_polling else LISTENING_S)

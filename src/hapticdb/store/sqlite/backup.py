@@ -24,9 +24,9 @@ from hapticdb.errors import (
 )
 from hapticdb.store.base import Progress
 from hapticdb.store.engines import BackupReport
-from hapticdb.store.sqlite import file as sqlite_file
+from hapticdb.store.sqlite import database_file as sqlite_file
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.file import named_errors
+from hapticdb.store.sqlite.database_file import named_errors
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 
 STEP_PAGES = 512
@@ -99,7 +99,7 @@ def _copied(
         ):
             _copy_pages(connection, made, progress)
             _check_pages(made)
-        file.look()  # the path must still lead to the copied file
+        file.verify()  # the path must still lead to the copied file
         if file.stamp is not None:
             file.check_stamp()
     return int(str(revision)), int(str(objects))

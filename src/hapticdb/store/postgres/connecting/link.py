@@ -112,7 +112,7 @@ class _Connection(psycopg.Connection[tuple[Any, ...]]):
         if self.link.given_up is not None:  # the end of a COPY that was given up
             raise self.link.given_up
         try:
-            return super().wait(self.link.until_out_of_patience(gen), *args, **options)
+            return super().wait(self.link.until_timeout(gen), *args, **options)
         except SilentServerError as error:
             self.link.given_up = error
             self.close()
@@ -242,7 +242,7 @@ class Link:
         self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
         return self._result()
 
-    def hear(self) -> None:
+    def receive_notifications(self) -> None:
         """Pass received notifications to the notify handlers. Never waits.
 
         Those received during a statement stay in libpq until then, or psycopg passes them on.
@@ -254,12 +254,12 @@ class Link:
     # -- waiting -----------------------------------------------------------------------------
 
     @property
-    def _patience_ms(self) -> int | None:
-        """Milliseconds to wait for an answer; None inside `unhurried`."""
+    def _timeout_ms(self) -> int | None:
+        """Milliseconds to wait for an answer; None inside `without_time_limit`."""
         return None if self._leisure else self._limit_ms
 
     @contextlib.contextmanager
-    def unhurried(self) -> Iterator[None]:
+    def without_time_limit(self) -> Iterator[None]:
         """Wait inside as long as the server answers a new client: for long statements."""
         self._leisure += 1
         try:
@@ -271,7 +271,7 @@ class Link:
         """Result of the statement in flight. Closes the connection when no result comes."""
         try:
             # the driver's own wait would take 10 s to end after Ctrl-C while a server hangs
-            answer = self.until_out_of_patience(generators.execute(self._pgconn))
+            answer = self.until_timeout(generators.execute(self._pgconn))
             found: pq.abc.PGresult = waiting.wait(answer, self._pgconn.socket, STEP_S)[-1]
             if found.status not in _FINE:
                 raise error_from_result(found, encoding="utf-8")  # noqa: TRY301 - may be a loss, too
@@ -284,16 +284,14 @@ class Link:
             raise
         return found
 
-    def until_out_of_patience(
-        self, answer: Generator[Any, Any, Result]
-    ) -> Generator[Any, Any, Result]:
+    def until_timeout(self, answer: Generator[Any, Any, Result]) -> Generator[Any, Any, Result]:
         """Run psycopg's generator of a wait; raise SilentServerError at the time limit."""
         started = heard = time.monotonic()
         try:
             wanted = next(answer)
             while True:
                 ready = yield wanted
-                now, most = time.monotonic(), self._patience_ms
+                now, most = time.monotonic(), self._timeout_ms
                 if ready:
                     heard = now
                 elif most is not None and 1000 * (now - started) > most:
@@ -316,7 +314,7 @@ class Link:
 
     def _stuck(self) -> SilentServerError:
         return SilentServerError(
-            f"{self.shown} did not answer within {self._patience_ms} ms: "
+            f"{self.shown} did not answer within {self._timeout_ms} ms: "
             "the server, or the way to it, hangs"
         )
 

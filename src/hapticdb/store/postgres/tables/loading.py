@@ -14,9 +14,9 @@ import psycopg
 
 from hapticdb.errors import ConnectionLostError
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres import schema_of
+from hapticdb.store.postgres import environment_schema
 from hapticdb.store.postgres.connecting import failures
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 
 # Advisory locks of an environment: one for its loaders, one for the builder of the index. The key
 # is the oid of a table of the environment. An oid has 32 unsigned bits, a key 32 signed bits.
@@ -71,9 +71,11 @@ class _Index:
 class Loading:
     """Context for the writes of many objects by one connection; partitions keep their indexes."""
 
-    def __init__(self, connection: ServerConnection, layout: Layout, *, is_spread: bool) -> None:
+    def __init__(
+        self, connection: ServerConnection, layout: Layout, *, is_partitioned: bool
+    ) -> None:
         self._connection = connection
-        self._index = _Index(connection, None if is_spread else layout)
+        self._index = _Index(connection, None if is_partitioned else layout)
         self._depth = 0
         self._is_owner = False
         self._has_written = False
@@ -136,7 +138,7 @@ class Loading:
         """Note a write inside the context."""
         self._has_written = True
 
-    def mend(self) -> None:
+    def build_missing_index(self) -> None:
         """Build the index missing after a killed loader, unless somebody is loading now."""
         connection = self._connection
         if not connection.is_owner() or self._index.is_there():
@@ -153,7 +155,7 @@ class Loading:
         connection = self._connection
         with self._alone() as is_alone:
             if is_alone and not connection.rows("SELECT 1 FROM environment WHERE revision > 0"):
-                schema_of.drop(connection)
+                environment_schema.drop(connection)
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[bool]:

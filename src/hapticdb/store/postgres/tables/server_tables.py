@@ -10,9 +10,9 @@ from psycopg import errors
 from hapticdb.store.base import LAYOUTS, NO_KEYS, Histogram, Keys, Layout, Object, Rows, Size
 from hapticdb.store.covering import Ranges
 from hapticdb.store.pairs import PUT, Ids, PairRow
-from hapticdb.store.postgres import schema_of
+from hapticdb.store.postgres import environment_schema
 from hapticdb.store.postgres.connecting import failures, wire
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.watching import channel_of
@@ -80,10 +80,10 @@ class ServerTables(Tables):
     def __init__(self, connection: ServerConnection) -> None:
         super().__init__(connection)
         self.url = connection.shown
-        made = schema_of.read_environment(connection)
-        self.grid, self.layout, self.wants_distances, self.identity, self._is_spread = made
+        made = environment_schema.read_environment(connection)
+        self.grid, self.layout, self.wants_distances, self.identity, self._is_partitioned = made
         self._seen = -1
-        self._loading = Loading(connection, self.layout, is_spread=self._is_spread)
+        self._loading = Loading(connection, self.layout, is_partitioned=self._is_partitioned)
         self._written: tuple[Any, ...] = ()
         self._highest_id = (0, 0)  # and its revision
 
@@ -147,7 +147,7 @@ class ServerTables(Tables):
         since, highest = self._highest_id
         found = self._do(HIGHEST_ID, (since,))
         self._highest_id = revision - 1, max(highest, int(found[0][0]))
-        if self._is_spread:
+        if self._is_partitioned:
             return int(self._do(NEXT_ID, (self._highest_id[1] + 1,))[0][0])
         return self._highest_id[1] + 1
 
@@ -190,7 +190,7 @@ class ServerTables(Tables):
         keys : of its new rows; on partitions a failed attempt may have left such rows.
         """
         lows, highs = ranges
-        if self._is_spread and keys.size:
+        if self._is_partitioned and keys.size:
             lows, highs = np.append(lows, keys.min()), np.append(highs, keys.max())
         chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(known.id)
         (found,) = self._connection.fetch(statements.DELETE_ROWS[self.layout], *chosen)
@@ -208,7 +208,7 @@ class ServerTables(Tables):
             )
             ((rows,),) = self._connection.execute(counted).fetchall()
             total, index = self._bytes()
-            if self._is_spread:
+            if self._is_partitioned:
                 ((more, index),) = self._connection.execute(SIZE_OF_PARTITIONS).fetchall()
                 total, index = total + int(more), int(index)
             (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()

@@ -107,8 +107,8 @@ def without_excluded(sql: str, layout: Layout, number: int) -> str:
     """
     test = KEY_TEST[layout]
     low, high, bits = f"${number}", f"${number + 1}", f"${number + 2}"
-    is_felt = f"CASE WHEN id BETWEEN {low} AND {high} THEN get_bit({bits}, id - {low}) = 0"
-    return sql.replace(test, f"{test} AND {is_felt} ELSE true END")
+    is_included = f"CASE WHEN id BETWEEN {low} AND {high} THEN get_bit({bits}, id - {low}) = 0"
+    return sql.replace(test, f"{test} AND {is_included} ELSE true END")
 
 
 def without_few(sql: str, layout: Layout, number: int) -> str:
@@ -144,18 +144,18 @@ def _known(table: str, where: str) -> str:
     return f"(SELECT * FROM {table} WHERE {where} AND {KNOWN.format(table)} OFFSET 0) AS {table}"
 
 
-def _spread(source: str, where: str) -> dict[Columns, str]:
+def _partitioned(source: str, where: str) -> dict[Columns, str]:
     return _packed(f"  FROM {source}" + _known("TABLE", f"{where} AND HELD"))
 
 
 _RANGES = "unnest($1, $2) AS range(low, high), LATERAL "
 _IN_RANGE = "z_val BETWEEN range.low AND range.high"
-SPREAD = Texts(
-    _spread("", "z_val = ANY ($1)"),
-    _spread("", "z_val = $1"),
-    _spread(_RANGES, _IN_RANGE),
+PARTITIONED = Texts(
+    _partitioned("", "z_val = ANY ($1)"),
+    _partitioned("", "z_val = $1"),
+    _partitioned(_RANGES, _IN_RANGE),
     AFTER,
-    _spread(_RANGES, f"{_IN_RANGE} AND id = $3"),
+    _partitioned(_RANGES, f"{_IN_RANGE} AND id = $3"),
     {layout: f"SELECT count(*) FROM {_RANGES}{_known(layout, _IN_RANGE)}" for layout in LAYOUTS},
     {
         layout: text.removesuffix(")") + f" AND {KNOWN.format(layout)} OFFSET 0)"

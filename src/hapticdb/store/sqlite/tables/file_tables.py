@@ -13,7 +13,7 @@ from hapticdb.store import parsing
 from hapticdb.store.base import LAYOUTS, NO_KEYS, Keys, Layout, Object, Rows, Size
 from hapticdb.store.covering import Ranges
 from hapticdb.store.pairs import PUT, Ids, PairRow
-from hapticdb.store.sqlite.connection import FileConnection
+from hapticdb.store.sqlite.file_connection import FileConnection
 from hapticdb.store.tables import LAST_REVISION, Tables
 
 Result = TypeVar("Result")
@@ -47,7 +47,7 @@ def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:
         "  FROM environment"
     )
     grid, layout = parsing.grid_of(connection.url, rows)
-    return grid, layout, parsing.wish_of(connection.url, rows[0][7])
+    return grid, layout, parsing.distances_wanted(connection.url, rows[0][7])
 
 
 class FileTables(Tables):

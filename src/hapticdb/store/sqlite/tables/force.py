@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
-from hapticdb.kernels import law as laws
+from hapticdb.kernels import force_law as laws
 from hapticdb.kernels.query import refining
 from hapticdb.store import parsing
 from hapticdb.store.base import Keys, Layout, LocatedShell, row_shift
@@ -66,9 +66,9 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
             cause = "a brick of the wrong length"
             raise parsing.damaged(connection.filename, cause) from error
 
-    is_felt = _LastExcluded().is_felt
+    is_included = _LastExcluded().is_included
     connection.create_aggregate_function("force", cast("Any", force), 3)
-    connection.create_scalar_function("is_felt", cast("Any", is_felt), 2)
+    connection.create_scalar_function("is_included", cast("Any", is_included), 2)
     connection.create_scalar_function("has_voxel", cast("Any", has_voxel), 2, deterministic=True)
 
 
@@ -115,8 +115,8 @@ def _without_excluded(
     if not frame.exclude.size:
         return sql, bindings
     test = TEST[layout]
-    felt = f"{test} AND is_felt(?{len(bindings) + 1}, id)"
-    return sql.replace(test, felt), (*bindings, apsw.pyobject(frame.exclude))
+    included = f"{test} AND is_included(?{len(bindings) + 1}, id)"
+    return sql.replace(test, included), (*bindings, apsw.pyobject(frame.exclude))
 
 
 class _LastExcluded:
@@ -126,7 +126,7 @@ class _LastExcluded:
         self._ids: Keys | None = None
         self._set: frozenset[int] = frozenset()
 
-    def is_felt(self, exclude: Keys, object_id: int) -> bool:
+    def is_included(self, exclude: Keys, object_id: int) -> bool:
         """Whether an object is not excluded."""
         if exclude is not self._ids:
             self._ids, self._set = exclude, frozenset(exclude.tolist())

@@ -1,0 +1,132 @@
+"""Sweeps of machines along joint paths: links against objects, and links against links."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from os import PathLike
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.environment import Environment
+from hapticdb.exact.path import SampledPath, checked_poses
+from hapticdb.exact.separation import CONTACT
+from hapticdb.exact.sweep import LinkPair, SweepRequest, swept_along
+from hapticdb.exact.swept import Swept
+from hapticdb.machines.joint_path import (
+    DEVIATION,
+    beyond_limits,
+    checked_values,
+    joint_path,
+    mover_of,
+)
+from hapticdb.machines.machine import Machine, pairs_of
+from hapticdb.machines.reader import read_machine
+from hapticdb.store.base import Object, Progress
+from hapticdb.store.finding import Words
+
+Floats = NDArray[np.float64]
+
+SAMPLES = 8
+"""Rows at which the links' distances are measured: the nearest pair is swept first."""
+
+
+def sweep_machine(
+    env: Environment,
+    machine: Machine | str | PathLike[str],
+    q: ArrayLike,
+    *,
+    at: ArrayLike | None = None,
+    where: Words = (),
+    exclude: Words = (),
+    contact: float = CONTACT, overlap: float = 0.0,
+    limit: float | None = None, seconds: float | None = None,
+    until_hit: bool = False,
+    progress: Progress | None = None,
+) -> Swept:  # fmt: skip
+    """Move a machine along a joint path: its hits with objects and with itself, or the least gap.
+
+    Parameters
+    ----------
+    env : Environment
+        As for `sweep`.
+    machine : Machine, str or path
+        As of `read_machine`, or a file for it.
+    q : (M, J) array
+        Values of the joints `machine.driven`, rad or m; they move linearly between two rows.
+    at : (4, 4) array or None
+        `world_from_base`, metres; the world's frame unless given.
+    where, exclude, contact, overlap, limit, seconds, until_hit, progress
+        As for `sweep`. Where the path starts, the machine may touch as a part at its place.
+
+    Returns
+    -------
+    Swept
+        `path.poses` are the values of all joints; `body` of a place is its link. Another link as
+        the object has the id 0. `notes` name joints beyond their limits, and the untested pairs of
+        links: without a list in the file, those in contact with all joints at 0.
+
+    Raises
+    ------
+    UsageError, FileError, ObjectNotFoundError
+        As for `sweep` and `read_machine`; if `q` is not finite or has another shape.
+    """
+    if not isinstance(machine, Machine):
+        machine = read_machine(machine)
+    request = SweepRequest(contact, overlap, seated=True, until_hit=until_hit, progress=progress)
+    request = request.begun(limit, seconds)
+    base = np.eye(4) if at is None else checked_poses(np.asarray(at)[None])[0]
+    values = checked_values(machine, q)
+    pairs, notes = _tested(machine, contact)
+    shown = values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)]
+    pairs.sort(key=lambda pair: _gap(machine, pair, shown, np.inf))
+    scene = [(0, link) for link in machine.surfaces]
+    path = joint_path(machine, values, [*pairs, *scene])
+    movers = [mover_of(machine, path, *link, None, base) for link in scene]
+    found = swept_along(
+        env, path, movers, request, where, exclude, lambda: _link_pairs(machine, path, pairs, base)
+    )
+    gap = found.gap._replace(at_least=max(found.gap.at_least - DEVIATION, 0.0))
+    if found.is_free and gap.place is not None:
+        gap = gap._replace(at_most=gap.at_most + DEVIATION)
+    remarks = (*machine.notes, *notes, *beyond_limits(machine, values))
+    return replace(found, gap=gap, notes=remarks)
+
+
+def _tested(machine: Machine, contact: float) -> tuple[list[tuple[int, int]], list[str]]:
+    """Pairs of links that move to one another and are tested, and a note of those left out."""
+    pairs = [pair for pair in pairs_of(machine.surfaces) if machine.chain(*pair)]
+    if machine.excluded is not None:
+        names = machine.names
+        return [(a, b) for a, b in pairs if {names[a], names[b]} not in machine.excluded], []
+    zero = machine.values(np.zeros((1, len(machine.driven))))
+    tested: list[tuple[int, int]] = []
+    touching: list[tuple[int, int]] = []
+    for a, b in pairs:
+        is_touching = _gap(machine, (a, b), zero, 2.0 * contact) <= contact
+        (touching if is_touching else tested).append((a, b))
+    remarks = ", ".join(f"{machine.names[a]} and {machine.names[b]}" for a, b in touching)
+    return tested, [
+        f"not tested, since they touch with all joints at 0: {remarks}"
+    ] if remarks else []
+
+
+def _gap(machine: Machine, pair: tuple[int, int], values: Floats, farthest: float) -> float:
+    """Least distance of two links at some values of the joints, infinite beyond the farthest."""
+    a, b = pair
+    poses = np.linalg.inv(machine.placed(values, a)) @ machine.placed(values, b)
+    tree = machine.surfaces[a].tree
+    near = machine.surfaces[b].nearest(tree, poses, np.full(len(poses), farthest))
+    return float(near.at_most.min())
+
+
+def _link_pairs(
+    machine: Machine, path: SampledPath, pairs: list[tuple[int, int]], base: Floats
+) -> Iterator[LinkPair]:
+    for a, b in pairs:
+
+        def frame(parameter: float, link: int = a) -> Floats:
+            return np.asarray(base @ machine.placed(path.at([parameter]), link)[0])
+
+        shape = machine.surfaces[a]
+        thing = Object(machine.names[a], machine.file, "", np.eye(4), 0, shape.box)
+        yield LinkPair(mover_of(machine, path, a, b, frame, base), thing, shape)

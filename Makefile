@@ -89,7 +89,7 @@ pins:
 	.venv-pins/bin/pip install ".[view]"
 	head -1 requirements/user.txt > .venv-pins/user.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb >> .venv-pins/user.txt
-	.venv-pins/bin/pip install ".[step,ifc,volume,pointcloud,postgres,cluster,extract,parquet]" --group dev
+	.venv-pins/bin/pip install ".[step,ifc,volume,pointcloud,postgres,cluster,extract,parquet,machines]" --group dev
 	head -1 requirements/dev.txt > .venv-pins/dev.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb | grep -vxFf .venv-pins/user.txt >> .venv-pins/dev.txt
 	mv .venv-pins/user.txt .venv-pins/dev.txt requirements/

@@ -71,8 +71,9 @@ def test_what_slides_at_its_start_is_no_hit(run: Run, scene: Path) -> None:
 
 
 def test_a_path_may_turn_about_another_centre(run: Run, scene: Path) -> None:
-    """Half a turn takes the tool through the first box, or about the box's middle round it."""
-    text = "x,y,z,qw,qx,qy,qz\n0,0,0.1,1,0,0,0\n0,0,-0.1,0,0,1,0\n"
+    """160 degrees take the tool through the first box, or about the box's middle round it."""
+    poses = "0,0,0.1,1,0,0,0\n0.0342020143,0,-0.0939692621,0.1736481777,0,0.984807753,0\n"
+    text = f"x,y,z,qw,qx,qy,qz\n{poses}"
     (scene.parent / "turn.csv").write_text(text)
     sweep = ("sweep", scene, *TOOL, "--path", "turn.csv")
     assert run(*sweep)[0] == 1

@@ -1,5 +1,6 @@
 """What a path says of its motion, against plain formulas and densely sampled places of the tool."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hapticdb.errors import UsageError
+from hapticdb.exact.moving_clash import hinge
 from hapticdb.exact.path import ToolPath
 from hapticdb.pointshell.shell import fibonacci_sphere
 from naive_motion import middle_of, placed, poses_at
@@ -108,3 +111,23 @@ def test_no_place_of_the_tool_moves_more_than_the_way(
     there = placed(path.at(ways), corners)
     moved_by = np.linalg.norm(there[:, None] - there[None], axis=3).max(axis=2)
     assert (moved_by <= np.abs(ways[:, None] - ways[None]) + ROUND).all()
+
+
+@pytest.mark.parametrize(("degrees", "told"), [(169.0, ""), (172.0, "172 degrees"), (270.0, "")])
+def test_a_turn_takes_the_short_way_with_a_warning_near_half_a_turn(
+    degrees: float, told: str
+) -> None:
+    way = ToolPath.of(hinge(2, (0, 0, 0), 0.0, degrees)[[0, -1]], BALL, np.zeros(3))
+    assert np.degrees(np.linalg.norm(way.motion.turns)) == pytest.approx(
+        min(degrees, 360.0 - degrees)
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        way.checked()
+    assert [told in str(one.message) for one in caught] == [True] * bool(told)
+
+
+def test_half_a_turn_is_refused() -> None:
+    way = ToolPath.of(hinge(2, (0, 0, 0), 0.0, 180.0)[[0, -1]], BALL, np.zeros(3))
+    with pytest.raises(UsageError, match=r"from pose 0 to pose 1 .* give a pose between"):
+        way.checked()

@@ -37,6 +37,7 @@ def blocks(kind: str, page: str = "README.md") -> list[str]:
         ("docs/realtime.md",),
         ("docs/paths.md",),
         ("docs/clashes.md",),
+        ("docs/machines.md",),
     ],
 )
 def test_every_block_of_the_pages_runs(tmp_path: Path, pages: tuple[str, ...]) -> None:

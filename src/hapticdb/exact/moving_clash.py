@@ -88,7 +88,7 @@ def find_meetings(
         raise UsageError(f"contact {contact} m: give a length above 0")
     with env.store.snapshot():
         tool = ToolSurface(env.shell(*of, points=1, inset=0.0))
-        path = ToolPath.of(poses, tool.corners, center_of(tool, about))
+        path = ToolPath.of(poses, tool.corners, center_of(tool, about)).checked()
         objects = env.select(against, of)
         gaps = box_gaps(tool, path, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]

@@ -1,5 +1,6 @@
 """Paths of rigid motion, parameterised by an upper bound on the motion of any tool point."""
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ Ints = NDArray[np.int64]
 
 RIGID = 1e-6
 """Greatest deviation of a rotation's columns from orthonormal ones; the same as for a frame."""
+MUCH, HALF_TURN = 170.0, 179.99
+"""Degrees between two poses: from the first on a doubtful turn, beyond the second half a turn."""
 AT_ONCE = 64
 """Segments of a batch of turns. Larger: more memory."""
 
@@ -96,6 +99,20 @@ class ToolPath(SampledPath):
             turns if len(turns) else np.zeros((1, 3)),
         )
         return cls(parameters, given, PathMotion(*map(np.ascontiguousarray, (*moved, center))))
+
+    def checked(self) -> "ToolPath":
+        """Itself; a warning for a turn of 170 degrees, and UsageError for one of 180.
+
+        A turn takes the short way, and half a turn has none.
+        """
+        degrees = np.degrees(np.linalg.norm(self.motion.turns, axis=1))
+        n = int(np.argmax(degrees))
+        steps = f"from pose {n} to pose {n + 1} the path turns by {degrees[n]:.4g} degrees"
+        if degrees[n] > HALF_TURN:
+            raise UsageError(f"{steps}, either way: give a pose between")
+        if degrees[n] >= MUCH:
+            warnings.warn(f"{steps}, the short way: is it the right one?", stacklevel=3)
+        return self
 
     def at(self, parameters: ArrayLike) -> Floats:
         """Poses (n, 4, 4) at path parameters (n,), clamped to the ends of the path."""

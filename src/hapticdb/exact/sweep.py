@@ -57,7 +57,8 @@ def sweep(
     shell : PointShell
         The tool. Its surface is what moves; its points do not matter.
     poses : (M, 4, 4) array
-        `world_from_tool`, rigid, metres; at least one. Motion between two: as for `ToolPath`.
+        `world_from_tool`, rigid, metres; at least one. Motion between two: as for `ToolPath`, so a
+        turn takes the short way: give a pose between where it is half a turn or more.
     where, exclude : iterable of int or str
         What can be met: the objects that `where` chooses, all if it is empty, without those of
         `exclude`. A part that is taken out must not hit itself. Words as for `Environment.find`.
@@ -81,13 +82,14 @@ def sweep(
     Raises
     ------
     UsageError
-        If a pose is not rigid, a number is out of range, or the tool has no surface.
+        If a pose is not rigid, a number is out of range, a turn is of 180 degrees, or the tool has
+        no surface.
     ObjectNotFoundError
         If a word chooses no object; if an object's surface is not in the database.
     """
     request = SweepRequest(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
     tool = ToolSurface(shell)
-    path = ToolPath.of(poses, tool.corners, center_of(tool, about))
+    path = ToolPath.of(poses, tool.corners, center_of(tool, about)).checked()
     return swept_along(env, path, [Mover(tool, path)], request, where, exclude)
 
 

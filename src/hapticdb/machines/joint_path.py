@@ -129,10 +129,9 @@ def mover_of(
     _, bend, turn = motion_bounds(machine, values, first, last)
     counts = np.maximum(np.sqrt(bend / (8.0 * DEVIATION)), turn / MOST_TURN)
     counts = np.maximum(np.ceil(counts), 1.0)
-    if counts.sum() > MOST_POSES:
+    if not counts.sum() <= MOST_POSES:
         raise UsageError(
-            f"link {machine.names[last]} turns too much for one sweep: divide the joint path into "
-            f"{int(counts.sum() // MOST_POSES) + 1}"
+            f"link {machine.names[last]} moves too far for one sweep: divide the joint path"
         )
     rows = np.arange(len(counts))
     knots = np.concatenate(

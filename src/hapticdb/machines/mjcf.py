@@ -43,7 +43,7 @@ class _Reading:
         for body in range(1, model.nbody):
             if carriers[body] == body:
                 self._add(body)
-        pieces: dict[int, list[tuple[Floats, float]]] = {}
+        pieces: dict[int, list[Floats]] = {}
         is_colliding = (model.geom_contype | model.geom_conaffinity) != 0
         colliding = {carriers[body] for body in model.geom_bodyid[is_colliding].tolist()}
         for geom, body in enumerate(model.geom_bodyid.tolist()):
@@ -51,9 +51,7 @@ class _Reading:
             if is_colliding[geom] or carrier not in colliding:
                 pieces.setdefault(self._link[carrier], []).extend(self._surface(geom, body))
         surfaces = {
-            link: LinkSurface(np.concatenate([one for one, _ in found]), max(c for _, c in found))
-            for link, found in pieces.items()
-            if found
+            link: LinkSurface(np.concatenate(found), 0.0) for link, found in pieces.items() if found
         }
         return Machine(
             str(self._path), tuple(self._names), surfaces, self._following(), self._excluded(),
@@ -96,8 +94,8 @@ class _Reading:
             body = int(model.body_parentid[body])
         return pose
 
-    def _surface(self, geom: int, body: int) -> list[tuple[Floats, float]]:
-        """Triangles of a geom, link's frame, and their chord error; none of a plane."""
+    def _surface(self, geom: int, body: int) -> list[Floats]:
+        """Triangles of a geom, link's frame; none of a plane."""
         model, kinds = self._model, self._geom
         kind, size = kinds(int(model.geom_type[geom])), model.geom_size[geom]
         name = model.geom(geom).name or str(geom)
@@ -108,21 +106,19 @@ class _Reading:
             one = model.mesh(model.geom_dataid[geom])
             vertices = model.mesh_vert[one.vertadr[0] :][: one.vertnum[0]].astype(np.float64)
             triangles = vertices[model.mesh_face[one.faceadr[0] :][: one.facenum[0]]]
-            chord = 0.0
         elif kind == kinds.mjGEOM_BOX:
-            triangles, chord = solids.box(2.0 * size)
+            triangles = solids.box(2.0 * size)
         elif kind == kinds.mjGEOM_CYLINDER:
-            triangles, chord = solids.cylinder(size[0], 2.0 * size[1])
+            triangles = solids.cylinder(size[0], 2.0 * size[1])
         elif kind in {kinds.mjGEOM_CAPSULE, kinds.mjGEOM_SPHERE}:
             length = 2.0 * size[1] if kind == kinds.mjGEOM_CAPSULE else 0.0
-            triangles, chord = solids.capsule(size[0], length)
+            triangles = solids.capsule(size[0], length)
         elif kind == kinds.mjGEOM_ELLIPSOID:
-            triangles, chord = solids.capsule(float(size.max()), 0.0)
-            triangles = triangles * (size / size.max())
+            triangles = solids.capsule(1.0, 0.0) * size
         else:
             raise FileError(f"{self._path}: geom {name} is a height field or SDF: make it a mesh")
         pose = self._in_carrier(body) @ _pose(model.geom_pos[geom], model.geom_quat[geom])
-        return [(triangles @ pose[:3, :3].T + pose[:3, 3], float(chord))]
+        return [triangles @ pose[:3, :3].T + pose[:3, 3]]
 
     def _following(self) -> tuple[Joint, ...]:
         """Joints, with those that follow others by an equality."""

@@ -144,18 +144,19 @@ def _placed(
 ) -> tuple[Floats, float]:
     """Triangles (T, 3, 3) of a <collision> or <visual>, link's frame, and their chord error."""
     geometry, pose = _child(path, of, "geometry"), _origin(path, of)
+    chord = 0.0
     for one in geometry:
         if one.tag == "mesh":
             triangles, chord = _mesh(path, link, one, meshes)
         elif one.tag == "box":
-            triangles, chord = solids.box(_numbers(path, one, "size", "", 3))
+            triangles = solids.box(_numbers(path, one, "size", "", 3))
         elif one.tag in {"cylinder", "capsule", "sphere"}:
             radius = float(_numbers(path, one, "radius", "", 1)[0])
             length = 0.0 if one.tag == "sphere" else float(_numbers(path, one, "length", "", 1)[0])
             if not (radius > 0.0 and length >= 0.0):
                 raise FileError(f"{path}: link {link!r} has a {one.tag} without size")
             is_flat = one.tag == "cylinder"
-            triangles, chord = (solids.cylinder if is_flat else solids.capsule)(radius, length)
+            triangles = (solids.cylinder if is_flat else solids.capsule)(radius, length)
         else:
             continue
         return triangles @ pose[:3, :3].T + pose[:3, 3], chord

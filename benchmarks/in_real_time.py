@@ -49,7 +49,7 @@ EXTENT = 1.6
 """Edge of the grid as a multiple of the model's longest side."""
 ROUNDS = 7
 """Number of timed passes over all poses; the result is their median."""
-WAYS: dict[str, dict[str, Any]] = {"flat": {"run": 0}, "session": {}}
+FORMS: dict[str, dict[str, Any]] = {"flat": {"run": 0}, "session": {}}
 """Options of `ResidentFrames`: no clusters; as a session has it."""
 RATES = (1000, 5000)
 """Frames a second of the sessions."""
@@ -84,13 +84,13 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
         CellTable.create(CELL_BYTES, distances=True) as table,
     ):
         residency = Residency(env.store, table)
-        frames = {name: ResidentFrames(residency, shell, **way) for name, way in WAYS.items()}
+        frames = {name: ResidentFrames(residency, shell, **form) for name, form in FORMS.items()}
         frames["distance"] = ResidentFrames(residency, shell, DistanceField())
         frames["distance"].evaluate(poses)  # fetches the cells that its band reaches
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
         first = frames["flat"]
         times: dict[str, list[float]] = {"dense": [], **{name: [] for name in frames}}
-        found: dict[str, NDArray[np.float64]] = {}
+        found: dict[str, NDArray[np.void]] = {}
         with table.reading() as row, awake():
             for _ in range(ROUNDS + 1):
                 for name, spent in times.items():
@@ -107,7 +107,7 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)
                     found[name] = out
-        assert all(np.array_equal(found[name], found["dense"]) for name in WAYS), "bit for bit"
+        assert all(np.array_equal(found[name], found["dense"]) for name in FORMS), "bit for bit"
         medians = {name: float(np.median(spent[1:])) for name, spent in times.items()}
         return {
             "points": len(shell),

@@ -79,7 +79,7 @@ class CoupledHand:
         )
         self._state.set_spring(spring)
         self._periods.enter(self._state)
-        self._state.row["staleness"] = np.iinfo(np.int64).max
+        self._state.slot["staleness"] = np.iinfo(np.int64).max
         for _ in range(round(REST / (self._period * RATE))):
             self.step(pose, np.zeros(6))
 

@@ -54,8 +54,6 @@ class LoopFigures:
     lateness: Spread
     elapsed: Spread
 
-    FIELDS = ("frames", "seconds", "missed", "lateness", "elapsed", "rate")
-
     @property
     def rate(self) -> float:
         """Frames a second."""

@@ -116,14 +116,17 @@ class Fetcher:
         if self.request.wrap:
             store = self.request.wrap(store)
         try:
-            store.watch(is_prompt=True)
+            store.watch()
         except BaseException:
             store.close()
             raise
         return store
 
     def warm_up(self) -> None:
-        """Run all steps of a round once, on one cell, so no later round compiles a kernel."""
+        """Run all steps of a round once, on one cell, so no later round compiles a kernel.
+
+        Only from now on a slow answer of the server is a loss: a busy machine is slow at the start.
+        """
         grid = self.request.grid
         record = np.zeros((), PREFETCH_REQUEST)
         record["tool"] = record["handle"] = grid.origin
@@ -132,6 +135,7 @@ class Fetcher:
         self.residency.load(self.residency.missing(request.cells(grid)[0][:1]))
         self.residency.warm_up()
         self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
+        self.store.watch(is_prompt=True)
 
     @property
     def lookahead(self) -> float:
@@ -220,6 +224,7 @@ class Fetcher:
         self.store = opened
         self._confirmed_at = -np.inf
         self.residency.reopened(self.store)
+        self.store.watch(is_prompt=True)
         self._version_seen = -1
 
     def close(self) -> None:

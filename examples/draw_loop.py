@@ -24,6 +24,7 @@ from hapticdb.page.drawing import put_at
 from hapticdb.page.page_process import new_server, stop
 from hapticdb.page.scene.browser_scene import BrowserScene
 from hapticdb.page.scene.view import SceneView
+from hapticdb.page.site import SceneFacts
 from hapticdb.poses import quaternion_of
 from hapticdb.sample import write_sample
 
@@ -149,7 +150,10 @@ def moving(
     stage: _Stage, ids: list[int], poses: Floats, colour: colours.Colour, text: str, view: str
 ) -> Iterator[Image.Image]:
     """Pictures of parts on the straight way between two displacements (2, 4, 4)."""
-    stage.looks.colour(ids, colour)
+    for i in ids:
+        stage.view.contents._members[i].colour = colour  # noqa: SLF001 - for the picture
+    stage.looks.hide(ids)
+    stage.looks.show(ids)
     _look(stage, view)
     starts = {i: stage.env.object(i).transform for i in ids}
     for share in 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, LIFTS)):
@@ -222,7 +226,10 @@ def main() -> None:
                 content="#webgl-software-rendering,[data-testid^=floating-panel]{display:none}"
             )
             (client,) = server.get_clients().values()
-            stage = _Stage(env, view, client, BrowserScene(client, view.contents), page)
+            looks = BrowserScene(
+                client, view.contents, view.up, float(SceneFacts.of(view).bounds[0, view.up])
+            )
+            stage = _Stage(env, view, client, looks, page)
             stage.looks.hide(obj.id for word in UNSEEN for obj in env.find(f"{word}/*"))
             page.wait_for_timeout(1000)
             pictures, rests = [], []

@@ -123,7 +123,7 @@ def test_a_tool_that_is_taken_six_times_at_once_is_drawn_once_at_a_time(
     """As by the button "Back to the start": viser calls each click in a thread of its own."""
     n_inside, together, pressed = 0, [], threading.Barrier(6)
 
-    def hold(*_: object) -> None:
+    def show_ghost(*_: object) -> None:
         nonlocal n_inside
         n_inside += 1
         threading.Event().wait(0.002)  # lets the other threads come
@@ -134,7 +134,7 @@ def test_a_tool_that_is_taken_six_times_at_once_is_drawn_once_at_a_time(
         pressed.wait(TIMEOUT)
         person.use_tool(person.tool, person.hand)
 
-    person.drawing = SimpleNamespace(hold=hold, rest=lambda: None)  # type: ignore[assignment]
+    person.drawing = SimpleNamespace(show_ghost=show_ghost, rest=lambda: None)  # type: ignore[assignment]
     with ThreadPoolExecutor(6) as viser:
         list(viser.map(press, range(6)))
     until(lambda: person.is_idle)

@@ -169,7 +169,7 @@ clashes.least_volume VOLUME [none is computed]: Cubic centimetres, or such as 5m
   overlaps, without smaller ones.
 clashes.html FILE: Write a page with pictures, a matrix and the table to a new file.
 clashes.junit FILE: Write findings and rules as JUnit test cases, for CI.
-clashes.bcf FILE: Write findings as topics of BCF 2.1, such as hall.bcfzip.
+clashes.bcf FILE: Write findings as topics of BCF 2.1 with GlobalIds of IFC, such as hall.bcfzip.
 clashes.poses FILE: Displacements of --of, metres, as for touch --poses: say when it meets what.
 clashes.turn AXIS: Instead: turn --of about x, y or z, as on a hinge.
 clashes.about X,Y,Z/mm [middle of --of]: a point of the hinge, or the centre of turns, scene's
@@ -191,7 +191,7 @@ extract.to POSE: Reach this displacement instead: x,y,z,qw,qx,qy,qz, millimetres
   0,5,0.2in,1,0,0,0; or a CSV file of one pose, metres.
 extract.screw LENGTH/mm: the pitch of a thread, of either hand, a turn.
 extract.path CSV: Write the path that was found.
-extract.animation HTML: Write a page that shows how the parts come out.
+extract.animation HTML: Write a page of the parts on their paths, in one file (pip install viser).
 extract.up [the files']: Axis that points up in the animation.
 
 move.translate X,Y,Z/m: shift from the present place, world frame.

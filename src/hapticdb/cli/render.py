@@ -185,6 +185,11 @@ def counted(n: float, noun: str = "") -> str:
     return f"{number} {plural}".rstrip()
 
 
+def counts(**numbers: float) -> str:
+    """Counts in words, by noun: ``1 object, 3,412 rows``."""
+    return ", ".join(counted(n, noun) for noun, n in numbers.items())
+
+
 def bytes_text(n: float) -> str:
     """Bytes in words: ``13.5 MB``."""
     for size, word in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):

@@ -31,12 +31,9 @@ class PipeClosedError(Exception):
 
 
 class Verbs(typer.core.TyperGroup):
-    """The verbs, in the order of a first visit; Ctrl-C and closed pipes pass through to `main`."""
+    """The verbs; Ctrl-C and closed pipes pass through to `main`."""
 
-    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401, ARG002, D102 - typer's types move between versions
-        return list(self.commands)
-
-    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401, D102
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401, D102 - typer's types move between versions
         interrupting.work()
         try:
             return super().invoke(ctx)

@@ -52,16 +52,17 @@ def opened_to_store(url: str) -> "Environment":
         return hapticdb.open(url, read_only=True)
 
 
-def chosen(env: "Environment", words: Iterable[str], option: str) -> "list[Object]":
+def chosen(env: "HasObjects", words: Iterable[str], option: str) -> "list[Object]":
     """Objects chosen by the words of an option, ordered by id; the error names the option."""
     return _found(env, as_named(env, words, option), option)
 
 
-def _found(env: "Environment", words: list[str], option: str) -> "list[Object]":
+def _found(env: "HasObjects", words: list[str], option: str) -> "list[Object]":
     from hapticdb.errors import ObjectNotFoundError
+    from hapticdb.store.finding import find_objects
 
     try:
-        return env.find(*words)
+        return find_objects(env, words)
     except ObjectNotFoundError as error:
         raise ObjectNotFoundError(f"{option}: {error}") from None
 

@@ -52,9 +52,6 @@ Ctrl-C and --seconds lose nothing: the next call goes on. Pairs that were not me
 meet each other object, and how deep. Where they do not is proved, as by sweep. Numbers are those of
 poses, from 0, or degrees. Nothing of it is kept.
 
---html, --junit and --bcf write reports: a page, test cases for CI, and topics for the tools that
-made an IFC file, whose GlobalIds they carry.
-
 The exit code is 1 when a pair of a --kind was found that is neither accepted nor meant, 3 when
 there is none but not all pairs were looked at, and else 0.
 
@@ -140,7 +137,7 @@ def clashes(
         refuse("with --poses and --turn", output, "html junit bcf")
         _moved(url, pairs, motion, output)
     refuse("without --poses and --turn", motion)
-    from hapticdb.clashes.clash_results import PAIR_KEYS
+    from hapticdb.clashes.clash_results import DEFAULT_KINDS, PAIR_KEYS
     from hapticdb.clashes.rules import add_rules
     from hapticdb.clashes.search import accept_pairs
 
@@ -172,7 +169,9 @@ def clashes(
         if table is not None:
             table.add(*findings.records())
     findings.say(url, output, is_grouped=meant.group is None and not meant.all_)
-    raise typer.Exit(_exit_code(found, kinds))
+    if any(not one.is_unmeasured for one in found.of(kinds or DEFAULT_KINDS)):
+        raise typer.Exit(1)
+    raise typer.Exit(NOT_DECIDED if found.left else 0)
 
 
 clashes.__doc__ = HELP
@@ -275,12 +274,6 @@ def _meetings(url: str, pairs: PairOptions, motion: TurnOptions) -> "list[Meetin
     ]
 
 
-def _exit_code(found: "Clashes", kinds: tuple[Kind, ...]) -> int:
-    if any(not one.is_unmeasured for one in (found.of(kinds) if kinds else found.of())):
-        return 1
-    return NOT_DECIDED if found.left else 0
-
-
 def _say_accepted(pairs: list[tuple[int, int]], because: str, output: _Output) -> None:
     output.add(None, *({"a": a, "b": b, "because": because or None} for a, b in pairs))
     if not output.json:
@@ -293,18 +286,15 @@ def _show_groups(groups: "list[Group]") -> None:
     shown = [one for one in groups if one.is_open]
     rows = (
         (one.id, one.kind, f"{len(one.pairs):,}", f"{one.n_parts:,}", one.length_text(),
-         _millimetres(one.pairs[0].place), one.status(), one.title())
+         place_text((1e3 * x for x in place[:3]), 0.1) if place else "", one.status(), one.title())
         for one in shown
+        for place in [one.pairs[0].place]
     )  # fmt: skip
     headings = ("group>", "are", "pairs>", "parts>?", "by>", "at, mm?", "status", "which")
     render.table(headings, rows, len(shown), "groups; --csv writes all pairs")
     if len(shown) < len(groups):
         count = render.counted(len(groups) - len(shown), "group")
         render.say(f"{count} meant or accepted: --all shows all pairs")
-
-
-def _millimetres(place: tuple[float, ...] | None) -> str:
-    return "" if place is None else place_text((1e3 * x for x in place[:3]), 0.1)
 
 
 def _show_pairs(findings: "list[Clash]") -> None:

@@ -55,10 +55,8 @@ def _copied(report: "CopyReport") -> str:
     there = render.counted(report.present, "object")
     if not report.copied:
         return f"{report.target}: complete already ({there}), nothing to do"
-    line = (
-        f"{report.target}: {render.counted(report.copied, 'object')} copied, "
-        f"{render.counted(report.voxels, 'voxel')}"
-    )
+    copied, voxels = render.counted(report.copied, "object"), render.counted(report.voxels, "voxel")
+    line = f"{report.target}: {copied} copied, {voxels}"
     if report.present:
         line += f"; {report.present} were there already"
     if report.renumbered:
@@ -102,12 +100,10 @@ def _record(found: "Difference") -> dict[str, Any]:
 
 
 def _equal(difference: "Difference") -> str:
-    line = (
-        f"{difference.a} and {difference.b} hold the same: "
-        f"{render.counted(difference.compared, 'object')}, "
-        f"{render.counted(difference.n_voxels, 'voxel')}, {difference.grids[0].side}^3 cells of "
-        f"{length_text(difference.grids[0].voxel_size)}"
-    )
+    held = render.counts(object=difference.compared, voxel=difference.n_voxels)
+    grid = difference.grids[0]
+    line = f"{difference.a} and {difference.b} hold the same: {held}, {grid.side}^3 cells of "
+    line += length_text(grid.voxel_size)
     in_a, in_b = difference.with_distances
     if in_a == in_b:
         line += f", {render.counted(in_a, 'object')} with distances" if in_a else ""

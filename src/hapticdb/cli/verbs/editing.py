@@ -36,12 +36,8 @@ def move(
     with hapticdb.open(url) as env:
         found = chosen(env, objects, "WORDS")
         if placed and len(found) > 1:
-            raise UsageError(
-                f"--matrix places one object, and {len(found)} are chosen: give one, or --translate"
-            )
-        with left_at(
-            f"all that was chosen has moved, or nothing: see 'hapticdb objects {env.url}'"
-        ):
+            raise UsageError(f"--matrix places one object, and {len(found)} are chosen: give one")
+        with left_at(f"all have moved, or nothing: see 'hapticdb objects {env.url}'"):
             if translate:
                 moved = env.shift([obj.id for obj in found], translate)
             else:

@@ -42,8 +42,6 @@ With --disassemble, what blocks the parts is taken off first, each object alone 
 is proved; --keep names what stays. Each step has a file of its own: --path out.csv writes out-1.csv
 and so on. The order may be longer than necessary.
 
---animation writes a page for any browser, with all that it needs in one file (pip install viser).
-
 {exit_codes(EXTRACT_VERDICTS)}
 
 Example: hapticdb extract car.db body/hood --path out.csv
@@ -88,9 +86,7 @@ class _Output(Output):
             refuse("without --animation", self, "up")
             return
         if not self.animation.lower().endswith(".html"):
-            raise UsageError(
-                f"--animation {self.animation}: it is a page, give a name that ends in .html"
-            )
+            raise UsageError(f"--animation {self.animation}: give a name that ends in .html")
         from hapticdb.page.animation import check_view
 
         check_view()
@@ -197,13 +193,9 @@ def _show(found: "Extraction") -> list[tuple[str, str]]:
             for one in found.blockers[:MOST_BLOCKERS]
         )
         render.table(("id>", "in the way", "of pulls>"), rows)
-    pulls, motions, poses = (
-        render.counted(n, noun)
-        for n, noun in ((found.pulls, "pull"), (found.motions, "motion"), (found.poses, "pose"))
-    )
     return [
         ("near its start", names_of(found.near) or "nothing"),
-        ("searched", f"{pulls}, {motions}, {poses}"),
+        ("searched", render.counts(pull=found.pulls, motion=found.motions, pose=found.poses)),
         ("took", f"{found.seconds:.1f} s"),
     ]
 

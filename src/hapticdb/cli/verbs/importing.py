@@ -6,7 +6,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from math import ceil, log2
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -58,12 +58,7 @@ class ReadingOptions:
 
 
 def import_(
-    url: str,
-    files: list[str],
-    *,
-    grid: NewGridOptions,
-    reading: ReadingOptions,
-    output: Output,
+    url: str, files: list[str], *, grid: NewGridOptions, reading: ReadingOptions, output: Output
 ) -> None:
     """Import CAD files and point clouds.
 
@@ -106,9 +101,7 @@ def _imported(url: str, files: Sequence[str], options: "ImportOptions") -> "list
     from hapticdb.mesh.parse import is_tessellated
 
     if options.chord is not None and not any(map(is_tessellated, files)):
-        render.note(
-            "--chord changes nothing: it is for STEP and IFC, and the triangles of others are kept"
-        )
+        render.note("--chord changes nothing: it is for STEP and IFC files")
     with (
         left_at("what went in is whole, and the same command goes on from there"),
         render.import_bar() as progress,
@@ -127,13 +120,15 @@ def _print_reports(
     if not all(report.error for report in reports):
         with closing(open_store(url, read_only=True)) as store:
             size, objects = store.size(), store.objects()
-            scene, held = scene_bounds(objects), render.counted(len(objects), "object")
-            rows, size_text = render.counted(size.rows, "row"), render.bytes_text(size.bytes)
+            scene, held = scene_bounds(objects), render.counts(object=len(objects), row=size.rows)
             voxel_size, bits = store.grid.voxel_size, store.grid.bits
-            line = f"{store.url}: {held}, {rows}, {size_text}; {store.grid.describe()}"
+            held += f", {render.bytes_text(size.bytes)}"
+            line = f"{store.url}: {held}; {store.grid.describe()}"
     for file, report in zip(files, reports, strict=True):
         if output.json:
-            render.say_json(_record(report) | {"scene": render.box_record(scene)})
+            n_voxels = sum(obj.voxels for obj in report.added)
+            more = {"objects": len(report.added), "voxels": n_voxels}
+            render.say_json(plain(report) | more | {"scene": render.box_record(scene)})
         elif report.error is None:
             render.say("\n  ".join(_lines(file, report)))
         if report.error is not None:
@@ -153,11 +148,6 @@ def _warn_of_voxels(size: float, bits: int) -> None:
         render.note(f"voxels of {length_text(size)} are coarse: --bits {more} makes them {finer}")
     elif size < TINY:
         render.note(f"voxels of {1e9 * size:.3g} nm: is --unit right?")
-
-
-def _record(report: "FileReport") -> dict[str, Any]:
-    voxels = sum(obj.voxels for obj in report.added)
-    return {**plain(report), "objects": len(report.added), "voxels": voxels}
 
 
 def _lines(file: str, report: "FileReport") -> list[str]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from hapticdb.cli import render
 from hapticdb.cli.emit import Output
-from hapticdb.cli.selection import as_named, opened_to_store
-from hapticdb.errors import AccessError, ObjectNotFoundError, UsageError
+from hapticdb.cli.selection import chosen, opened_to_store
+from hapticdb.errors import AccessError, UsageError
 from hapticdb.tabular.schema import OBJECT, record
 from hapticdb.units import length_text, place_text
 
@@ -127,29 +127,23 @@ def objects(
     Example: hapticdb objects car.db --name up=z
     """
     from hapticdb.store.connect import open_store
-    from hapticdb.store.finding import find_objects
 
     if limit is not None and limit < 0:
         raise UsageError(f"--limit {limit}: give 0, for all, or more")
     with closing(open_store(url, read_only=True)) as store:
         shown_url = store.url
-        try:
-            words = as_named(store, name or (), "--name")
-            found = find_objects(store, words) if words else store.objects()
-        except ObjectNotFoundError as error:
-            raise ObjectNotFoundError(f"--name: {error}") from None
+        found = chosen(store, name, "--name") if name else store.objects()
     if limit is None:
         limit = PAGE if sys.stdout.isatty() and not output.json else 0
     shown = found[: limit or None]
-    if output.json:
-        for obj in shown:
-            render.say_json(record(obj, OBJECT))
-    elif found:
+    for obj in shown if output.json else ():
+        render.say_json(record(obj, OBJECT))
+    if found and not output.json:
         rows = ((o.id, o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in shown)
         render.table(("id>", "name", "voxels>", "size, mm>", "file?"), rows)
         if len(shown) < len(found):
             render.note(f"{len(shown):,} of {len(found):,} objects; --limit 0 shows all")
-    else:
+    elif not output.json:
         render.note(f"{shown_url} is empty; 'hapticdb import URL FILE' fills it")
 
 

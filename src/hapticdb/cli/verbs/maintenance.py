@@ -60,18 +60,13 @@ def _show(report: "CheckReport") -> None:
         lines.append(f"and {render.counted(report.n_findings - len(lines), 'finding')} more")
     for line in lines:
         render.say(line)
-    render.say(_checked(report), int(not report.is_sound))
-
-
-def _checked(report: "CheckReport") -> str:
+    held = render.counts(object=report.objects, voxel=report.voxels, row=report.rows)
+    line = f"{report.url} is sound: {held}"
     if not report.is_sound:
         count = render.counted(report.n_findings, "finding")
         mend = "'--repair' mends rows, " if report.is_mendable else ""
-        return f"{report.url} is damaged: {count}; {mend}restore a copy or import the files again"
-    return (
-        f"{report.url} is sound: {render.counted(report.objects, 'object')}, "
-        f"{render.counted(report.voxels, 'voxel')}, {render.counted(report.rows, 'row')}"
-    )
+        line = f"{report.url} is damaged: {count}; {mend}restore a copy or import the files again"
+    render.say(line, int(not report.is_sound))
 
 
 def backup(url: str, file: str, *, replace: bool = False, output: Output) -> None:

@@ -36,9 +36,7 @@ def replay(recording: str, url: str | None = None, *, output: TableOutput) -> No
     from hapticdb.recording.file import Recording
 
     if output.csv is not None and (url is not None or output.json):
-        raise UsageError(
-            "--csv writes what was recorded and compares nothing: leave out URL, --json"
-        )
+        raise UsageError("--csv compares nothing: leave out URL, --json")
     session = Recording(recording)
     if session.n_torn:
         render.note(

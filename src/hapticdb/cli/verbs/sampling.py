@@ -61,10 +61,8 @@ def demo(
 
 
 def _import_text(one: "Imported") -> str:
-    size = (
-        f"{render.counted(one.objects, 'object')}, {render.counted(one.voxels, 'voxel')}, "
-        f"{render.counted(one.rows, 'row')}, {render.bytes_text(one.bytes)}"
-    )
+    size = render.counts(object=one.objects, voxel=one.voxels, row=one.rows)
+    size += f", {render.bytes_text(one.bytes)}"
     if not one.is_new:
         return f"{one.url}: {size}; there already"
     rate = render.counted(one.voxels / one.seconds, "voxel")

@@ -34,6 +34,7 @@ class PageOptions:
         from hapticdb.server.access import Role
         from hapticdb.server.served import Serving
         from hapticdb.store.connect import open_store
+        from hapticdb.store.urls import redact
 
         urls = dict.fromkeys(Role, url) | dict(_pair(text, "--role-url") for text in role_urls)
         for other in dict.fromkeys(urls.values()):
@@ -50,7 +51,8 @@ class PageOptions:
             raise UsageError(f"--recordings {folder}: no such folder")
         return Serving(
             urls=urls, tools=tuple(self.tool or ()), tokens=tokens,
-            open_role=None if tokens else Role.EDITOR, title=_title(url), rendering=self.rendering,
+            open_role=None if tokens else Role.EDITOR, rendering=self.rendering,
+            title=f"{Path(redact(url).partition('?')[0]).stem} - hapticdb",
             recordings=None if folder is None else str(Path(folder).resolve()),
         )  # fmt: skip
 
@@ -132,13 +134,6 @@ def _check_extra() -> None:
                if find_spec(name) is None]  # fmt: skip
     if missing:
         raise MissingExtraError(f"the browser view needs {', '.join(missing)}: {pip_line('view')}")
-
-
-def _title(url: str) -> str:
-    """Title of the page: the file's name, or the database's from a URL without secrets."""
-    from hapticdb.store.urls import redact
-
-    return f"{Path(redact(url).partition('?')[0]).stem} - hapticdb"
 
 
 def _tokens(file: str | None, *, are_made: bool) -> "dict[str, Role]":

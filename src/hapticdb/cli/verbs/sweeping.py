@@ -39,7 +39,8 @@ IFC) leave it open. The triangles decide, between the poses, too; the gap is rig
 %.
 
 Between two poses the centre moves straight while the tool turns about it. Segment 0 leads from pose
-0 to pose 1.
+0 to pose 1. Turns take the short way: for half a turn or more give a pose between, or a machine of
+one joint, whose angles go on beyond 360 degrees.
 
 With --part, objects of the environment are the tool, one rigid body; the poses are displacements
 from their place: x,y,z 0 and qw 1 leaves them there. 'hapticdb objects --help' says how names
@@ -158,9 +159,7 @@ def _check(one: ListedSweep, tool_unit: str | None, batch: str | None, csv: str 
     if not one.path:
         raise UsageError("give --path, a file of poses, or --batch")
     if one.part and tool_unit is not None:
-        raise UsageError(
-            "--tool-unit belongs to --tool: a part has the unit that it was imported in"
-        )
+        raise UsageError("--tool-unit has no meaning with --part: leave it out")
 
 
 def _checked_machine(
@@ -280,23 +279,19 @@ def _show(findings: _Findings) -> None:
         for place in found.hits
     ]
     rows += [
-        (
-            one.object.id,
-            name_of(one),
-            "touched",
-            until_text(one.until).removesuffix(" of the path"),
-            length_text(one.start_at_least) if one.start_at_least else "",
-            length_text(one.start) if math.isfinite(one.start) else "",
-        )
+        (one.object.id, name_of(one), "touched",
+         until_text(one.until).removesuffix(" of the path"),
+         length_text(one.start_at_least) if one.start_at_least else "",
+         length_text(one.start) if math.isfinite(one.start) else "")
         for one in found.touching
-    ]
-    if rows:
-        columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
-        render.table(columns, rows, len(rows))
+    ]  # fmt: skip
+    columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
+    render.table(columns, rows, len(rows))
     poses = render.counted(len(found.path.parameters), "pose" if findings.shell else "row")
     facts = [("path", f"{poses}, {length_text(found.path.length)}")]
     if found.is_free:
-        facts.append(("gap", _gap_range(found, gap_text(found))))
+        at_most = f" proved, {length_text(found.gap.at_most)} measured at the nearest place"
+        facts.append(("gap", gap_text(found) + at_most * (found.gap.place is not None)))
     near, checks = (
         render.counted(found.objects, "object"),
         render.counted(found.queries, "proximity check"),
@@ -304,10 +299,3 @@ def _show(findings: _Findings) -> None:
     searched = f"{near} near the path, {checks}"
     facts += [("looked at", searched), ("took", f"{findings.seconds:.2f} s")]
     render.facts(facts)
-
-
-def _gap_range(found: "Swept", text: str) -> str:
-    """Lower and upper bound of the gap, in words."""
-    if found.gap.place is None:
-        return text
-    return f"{text} proved, {length_text(found.gap.at_most)} measured at the nearest place"

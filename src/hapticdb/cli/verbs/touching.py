@@ -52,9 +52,7 @@ class _Output(TableOutput):
         else:
             refuse("without --out", self, "on")
         if [self.csv, self.contacts_csv, "-" if self.json else ""].count(STDOUT) > 1:
-            raise UsageError(
-                "--csv -, --contacts-csv - and --json: only one may be standard output"
-            )
+            raise UsageError("--csv -, --contacts-csv -, --json: only one may be standard output")
 
 
 @dataclass(frozen=True)

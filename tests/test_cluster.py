@@ -193,7 +193,7 @@ def test_a_scheduler_that_is_not_there_is_told_in_a_line(
         refused(run("import", "new.db", made / "boxes.glb", "--on", address), "no scheduler at")
     assert not scene.with_name("new.db").exists()
     asked = ("touch", scene, "--tool", "tool.npz", "--poses", "path.csv")
-    refused(run(*asked, "--on", "tcp://127.0.0.1:1"), "give --out, too")
+    refused(run(*asked, "--on", "tcp://127.0.0.1:1"), "--on has no meaning without --out")
     refused(run(*asked, "--on", "gpu", "--out", "a.npz"), "device 'gpu'")
     refused(run("extract", scene, "box1", "--on", "tcp://127.0.0.1:1"), "--disassemble")
     refused(run("clashes", scene, "--of", "1", "--turn", "z", "--on", "tcp://x:1"), "--on")

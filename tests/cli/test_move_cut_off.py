@@ -60,7 +60,7 @@ def test_a_move_cut_off_moves_none(
             assert (done.returncode, done.stdout) == (CODES[how], ""), done.stderr
             assert "Traceback" not in done.stderr
             if how == "SIGINT":
-                assert "all that was chosen has moved, or nothing" in done.stderr
+                assert "all have moved, or nothing" in done.stderr
             assert contents(env) == before
             succeeded(run(*command))
             heights = [obj.transform[2, 3] for obj in env.objects()]

@@ -9,6 +9,9 @@ from hapticdb.store.base import Layout, Store, row_shift
 from hapticdb.store.connect import create_store, open_store
 from voxels import KINDS, blob, write_voxels
 
+one_kind = pytest.mark.parametrize("store", [("brick", "z")], ids=["brick-z"], indirect=True)
+"""Of tests of objects, surfaces, pairs and commits, which are the same over all kinds of rows."""
+
 
 class Case:
     """Tests of one engine; the module of a subclass has the fixture `new_url`."""

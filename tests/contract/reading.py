@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from contract.case import StoreCase
+from contract.case import StoreCase, one_kind
 from hapticdb.grid import Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import LocatedShell, Store
@@ -98,6 +98,7 @@ class ReadingContract(StoreCase):
         store.analyze(10)
         assert store.freshness(10) == (3, 0)
 
+    @one_kind
     def test_costs_are_kept_by_machine(self, store: Store) -> None:
         assert store.costs("here") is None
         store.save_costs("here", {"row": 0.25, "row.spread": 0.5})

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from children import TIMEOUT
-from contract.case import StoreCase
+from contract.case import StoreCase, one_kind
 from hapticdb.errors import DatabaseError, EnvironmentExistsError, ReadOnlyError, UsageError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Store
@@ -15,6 +15,7 @@ from voxels import EVERYWHERE, blob, is_noticed, kind, write_voxels
 
 
 class SharingContract(StoreCase):
+    @one_kind
     def test_a_snapshot_sees_one_revision(self, store: Store) -> None:
         reader = self.reopen(store)
         before = reader.size().rows
@@ -28,6 +29,7 @@ class SharingContract(StoreCase):
         assert reader.version() != version
         reader.close()
 
+    @one_kind
     def test_a_store_belongs_to_the_thread_that_opened_it(self, store: Store) -> None:
         with (
             ThreadPoolExecutor(1) as thread,
@@ -36,11 +38,13 @@ class SharingContract(StoreCase):
             thread.submit(store.objects).result(TIMEOUT)
         assert len(store.objects()) == 2
 
+    @one_kind
     def test_a_closed_store_says_so(self, store: Store) -> None:
         store.close()
         with pytest.raises(DatabaseError):
             store.objects()
 
+    @one_kind
     def test_a_store_opened_to_read_refuses_to_write(self, store: Store) -> None:
         reader = self.reopen(store)
         writes: list[Callable[[], object]] = [
@@ -55,6 +59,7 @@ class SharingContract(StoreCase):
         assert store.costs("here") is None
         reader.close()
 
+    @one_kind
     def test_a_commit_of_another_is_noticed_once(self, store: Store) -> None:
         reader = self.reopen(store)
         reader.watch()
@@ -73,6 +78,7 @@ class SharingContract(StoreCase):
             assert not reader.has_changed()
         reader.close()
 
+    @one_kind
     def test_none_of_many_commits_is_missed(self, store: Store) -> None:
         reader = self.reopen(store)
         voxel = np.array([[1, 2, 3]])
@@ -87,6 +93,7 @@ class SharingContract(StoreCase):
         assert is_noticed(reader)
         reader.close()
 
+    @one_kind
     def test_reading_neither_hides_a_commit_nor_invents_one(self, store: Store) -> None:
         reader = self.reopen(store)
         reader.watch()
@@ -100,6 +107,7 @@ class SharingContract(StoreCase):
         assert is_noticed(reader)
         reader.close()
 
+    @one_kind
     def test_a_commit_during_a_snapshot_is_noticed_after_it(self, store: Store) -> None:
         """Inside the snapshot `has_changed` is refused, because no commit is visible there."""
         reader = self.reopen(store)

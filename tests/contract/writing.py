@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from contract.case import StoreCase
+from contract.case import StoreCase, one_kind
 from hapticdb.errors import (
     ConflictError,
     EnvironmentExistsError,
@@ -38,6 +38,7 @@ def made_up(store: Store) -> set[str]:
 
 
 class WritingContract(StoreCase):
+    @one_kind
     def test_objects_return_as_written(self, store: Store) -> None:
         first, second = store.objects()
         assert (first.id, second.id) == (1, 2)
@@ -51,6 +52,7 @@ class WritingContract(StoreCase):
             first.bounds, voxel_object(store.grid, blob(1, (20, 20, 20))).bounds
         )
 
+    @one_kind
     def test_some_objects_and_outlines_are_those_of_all(self, store: Store) -> None:
         objects = store.objects()
         assert [obj.name for obj in store.objects([7, 2])] == ["two"]
@@ -111,6 +113,7 @@ class WritingContract(StoreCase):
         with pytest.raises(ObjectNotFoundError):
             store.remove(2)
 
+    @one_kind
     def test_removed_parts_are_known_until_they_are_there_again(self, store: Store) -> None:
         link = store.object(1).link
         assert store.removed(link) == set()
@@ -198,6 +201,7 @@ class WritingContract(StoreCase):
             store.add(*self.part(store, digest, name), surface)
         return store
 
+    @one_kind
     def test_a_shape_is_written_once_however_many_objects_have_it(self, shapes: Store) -> None:
         assert shapes.surfaces(["ball", "cone", "nothing"]) == {"ball": BALL, "cone": CONE}
         assert shapes.surfaces(["cone"]) == {"cone": CONE}
@@ -207,12 +211,14 @@ class WritingContract(StoreCase):
         size = shapes.size()
         assert (size.surfaces, size.surface_bytes) == (4, sum(map(len, held.values())))
 
+    @one_kind
     def test_a_move_leaves_the_surface(self, shapes: Store) -> None:
         for object_id, name in ((3, "three"), (5, "five")):
             record, rows = self.part(shapes, shapes.object(object_id).digest, name)
             shapes.replace(replace(record, id=object_id), rows)
         assert shapes.surfaces(["ball", "cone"]) == {"ball": BALL, "cone": CONE}
 
+    @one_kind
     def test_a_surface_goes_with_the_last_object_that_has_it(self, shapes: Store) -> None:
         shapes.remove(3)
         assert made_up(shapes) == {"ball", "cone"}
@@ -224,11 +230,13 @@ class WritingContract(StoreCase):
         shapes.add(*self.part(shapes, "ball", "again"), BALL)
         assert shapes.surfaces(["ball"]) == {"ball": BALL}
 
+    @one_kind
     def test_a_refused_write_leaves_no_surface(self, shapes: Store) -> None:
         with pytest.raises(EnvironmentExistsError):
             shapes.add(*self.part(shapes, "cube", "five"), b"cube")
         assert made_up(shapes) == {"ball", "cone"}
 
+    @one_kind
     def test_a_snapshot_keeps_a_surface_that_goes(self, shapes: Store) -> None:
         reader = self.reopen(shapes)
         with reader.snapshot():
@@ -238,6 +246,7 @@ class WritingContract(StoreCase):
         assert reader.surfaces(["cone"]) == {}
         reader.close()
 
+    @one_kind
     def test_rows_come_back_in_order(self, store: Store) -> None:
         revision = store.revision()
         assert list(store.pairs()) == []
@@ -250,11 +259,13 @@ class WritingContract(StoreCase):
         assert list(store.pairs()) == []
         assert store.revision() == revision
 
+    @one_kind
     def test_a_later_revision_stays(self, store: Store) -> None:
         store.put_pairs([FIRST])
         store.put_pairs([FIRST._replace(kind=Kind.TOUCHING, revision=1)])
         assert list(store.pairs()) == [FIRST]
 
+    @one_kind
     def test_the_mark_is_that_of_who_wrote_last(self, store: Store) -> None:
         assert store.pairs().mark == Mark()
         mine = store.put_pairs([FIRST], was=Mark())
@@ -272,6 +283,7 @@ class WritingContract(StoreCase):
         assert [row[:2] for row in kept] == [(1, 2), (1, 3)]
         assert [[row[:2] for row in part] for part in kept.parted({3})] == [[(1, 3)], [(1, 2)]]
 
+    @one_kind
     def test_an_acceptance_outlasts_a_new_measurement(self, store: Store) -> None:
         store.put_pairs([FIRST])
         store.accept_pair(1, 2, "a press fit", "ball cone")
@@ -282,6 +294,7 @@ class WritingContract(StoreCase):
         store.accept_pair(1, 2, None, None)
         assert list(store.pairs()) == [FIRST._replace(at_least=0.2)]
 
+    @one_kind
     def test_a_snapshot_keeps_the_pairs_that_it_sees(self, store: Store) -> None:
         store.put_pairs([FIRST])
         reader = self.reopen(store)
@@ -292,6 +305,7 @@ class WritingContract(StoreCase):
         assert list(reader.pairs()) == [FIRST, SECOND]
         reader.close()
 
+    @one_kind
     def test_rules_come_back_in_order_and_are_replaced_together(self, store: Store) -> None:
         revision = store.revision()
         assert store.rules() == ()

@@ -179,8 +179,8 @@ def frames_under(law_type: type, threads: int, *, single: bool) -> Any:  # noqa:
             )  # fmt: skip
             _add_up(both, t)
             if shares > 1:
-                if t < SUMS:
-                    sums[n, block, t] = both[t, 0]
+                for row in range(t, SUMS, threads):
+                    sums[n, block, row] = both[row, 0]
                 cuda.threadfence()
                 cuda.syncthreads()
                 if t == 0:

@@ -52,6 +52,8 @@ def test_a_mesh_of_a_package_is_found_beside_the_file_and_scaled(tmp_path: Path)
         (mesh("package://pack/none.stl"), "not beside the file"),
         (mesh("https://example.org/a.stl"), "not beside the file"),
         (mesh("/etc/a.stl"), "not beside the file"),
+        (mesh("package://[x/a.stl"), "not beside the file"),
+        (mesh("a" * 5000), "not beside the file"),
         (mesh("m.urdf"), "m.urdf"),
     ],
 )  # fmt: skip
@@ -115,6 +117,7 @@ def test_an_mjcf_file_has_the_kinematics_of_mujoco(tmp_path: Path) -> None:
     [
         ('type="slide"', 'type="ball"', "'lift' is free or a ball"),
         ("0.1 0.5 0 0 0", "0.1 0.5 1 0 0", "closed kinematics"),
+        ("</equality>", '<joint joint1="grip" joint2="turn"/></equality>', "follows both"),
         ("<worldbody>", "<worldbody", "XML"),
     ],
 )
@@ -124,6 +127,26 @@ def test_a_bad_mjcf_file_is_one_line(tmp_path: Path, was: str, becomes: str, tol
     with pytest.raises(FileError, match=told) as caught:
         read_machine(tmp_path / "m.xml")
     assert "\n" not in str(caught.value)
+
+
+def test_bodies_and_joints_without_names_are_told_apart(tmp_path: Path) -> None:
+    arm = '<body pos="{} 0 0"><joint{}/><geom size="0.1"/></body>'
+    arms = arm.format(1, "") + arm.format(2, ' name="joint 1"')
+    text = f'<body><joint type="slide"/><geom size="0.1"/>{arms}</body>'
+    (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
+    machine = read_machine(tmp_path / "m.xml")
+    assert len(set(machine.driven)) == 3
+    assert len(set(machine.names)) == 4
+    assert machine.excluded is not None
+    assert frozenset(machine.names[2:]) not in machine.excluded
+
+
+def test_a_mocap_body_stands_where_the_file_has_it(tmp_path: Path) -> None:
+    text = '<body name="m" mocap="true" pos="0 0 9"><geom size="0.1"/></body>'
+    (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
+    machine = read_machine(tmp_path / "m.xml")
+    (link,) = machine.surfaces
+    assert machine.placed(np.zeros((1, 1)), link)[0, :3, 3].tolist() == [0.0, 0.0, 9.0]
 
 
 def test_an_srdf_file_names_the_pairs_that_are_left_out(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, MissingExtraError, pip_line
 from hapticdb.machines import solids
-from hapticdb.machines.machine import HINGE, SLIDE, Joint, LinkSurface, Machine
+from hapticdb.machines.machine import FIXED, HINGE, SLIDE, Joint, LinkSurface, Machine
 from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,9 @@ class _Reading:
     def __init__(self, path: Path, model: Any, mujoco: Any) -> None:  # noqa: ANN401 - untyped
         self._path, self._model = path, model
         self._geom, self._joint, self._equal = mujoco.mjtGeom, mujoco.mjtJoint, mujoco.mjtEq
-        self._names, self._joints = [model.body(0).name or "world"], list[Joint]()
+        self._bodies = _named("body", [model.body(n).name for n in range(model.nbody)])
+        self._hinges = _named("joint", [model.joint(n).name for n in range(model.njnt)])
+        self._names, self._joints = [self._bodies[0]], list[Joint]()
         self._link = {0: 0}
         self._notes: list[str] = []
 
@@ -59,7 +61,10 @@ class _Reading:
         )  # fmt: skip
 
     def _add(self, body: int) -> None:
-        """Add a link for a body, and one without surface between each two of its joints."""
+        """Add a link for a body, and one without surface between each two of its joints.
+
+        A body without joints is a mocap body, fixed where the file has it.
+        """
         model = self._model
         parent = self._link[int(model.body_weldid[model.body_parentid[body]])]
         origin = self._in_carrier(int(model.body_parentid[body])) @ _pose(
@@ -67,7 +72,7 @@ class _Reading:
         )
         first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
         for n in range(first, first + count):
-            kind, name = self._joint(int(model.jnt_type[n])), model.joint(n).name or f"joint {n}"
+            kind, name = self._joint(int(model.jnt_type[n])), self._hinges[n]
             if kind not in {self._joint.mjJNT_HINGE, self._joint.mjJNT_SLIDE}:
                 raise FileError(
                     f"{self._path}: joint {name!r} is free or a ball: known are hinge and slide"
@@ -75,7 +80,7 @@ class _Reading:
             low, high = model.jnt_range[n] if model.jnt_limited[n] else (-np.inf, np.inf)
             child = len(self._names)
             is_last = n == first + count - 1
-            self._names.append(model.body(body).name if is_last else f"before {name}")
+            self._names.append(self._bodies[body] if is_last else f"before {name}")
             self._joints.append(
                 Joint(
                     name, HINGE if kind == self._joint.mjJNT_HINGE else SLIDE, parent, child,
@@ -84,6 +89,11 @@ class _Reading:
                 )
             )  # fmt: skip
             parent, origin = child, np.eye(4)
+        if not count:
+            self._names.append(self._bodies[body])
+            name, child = f"before {self._bodies[body]}", len(self._names) - 1
+            self._joints.append(Joint(name, FIXED, parent, child, origin, np.zeros(3)))
+            parent = child
         self._link[body] = parent
 
     def _in_carrier(self, body: int) -> Floats:
@@ -132,6 +142,11 @@ class _Reading:
                     "kinematics are not read, leave it out"
                 )
             one, other = found[first], found[second]
+            if one.driver:
+                raise FileError(
+                    f"{self._path}: joint {one.name!r} follows both {one.driver!r} and "
+                    f"{other.name!r}: leave out one of them"
+                )
             offset = one.zero + data[0] - data[1] * other.zero
             found[first] = one._replace(driver=other.name, factor=data[1], offset=offset)
         return tuple(found)
@@ -149,6 +164,17 @@ class _Reading:
             if above:
                 pairs.add(frozenset((link, above)))
         return frozenset(frozenset(names[n] for n in pair) for pair in pairs)
+
+
+def _named(kind: str, names: list[str]) -> list[str]:
+    """Names, all different: those without one get their kind and number."""
+    found = []
+    for n, name in enumerate(names):
+        own = name or f"{kind} {n}"
+        while not name and own in names:
+            own += "'"
+        found.append(own)
+    return found
 
 
 def _pose(place: Floats, quaternion: Floats) -> Floats:

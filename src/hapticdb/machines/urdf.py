@@ -1,5 +1,6 @@
 """URDF: links, joints, meshes."""
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -121,8 +122,10 @@ def _joint(path: Path, of: ET.Element, order: list[str]) -> Joint:
         known = ", ".join(_KINDS)
         raise FileError(f"{path}: joint {name!r} is of the kind {kind[:40]!r}: known are {known}")
     axis = _numbers(path, of.find("axis"), "xyz", "1 0 0", 3)
-    if kind != "fixed" and not axis.any():
+    length = float(np.abs(axis).max())
+    if kind != "fixed" and not length:
         raise FileError(f"{path}: joint {name!r} has an axis without length")
+    axis /= length or 1.0
     limit, mimic = of.find("limit"), of.find("mimic")
     low, high = (
         float(_numbers(path, limit if kind != "continuous" else None, side, f"{sign}1e300", 1)[0])
@@ -182,7 +185,10 @@ def _mesh(
 
 def _beside(path: Path, name: str) -> Path | None:
     """File of a mesh: relative to the URDF file, or of a package in a folder above it."""
-    url = urlsplit(name)
+    try:
+        url = urlsplit(name)
+    except ValueError:
+        return None
     if url.scheme in {"package", "model"}:
         rest = unquote(url.path.lstrip("/"))
         folders = list(path.resolve().parents)[:_LEVELS]
@@ -191,4 +197,4 @@ def _beside(path: Path, name: str) -> Path | None:
         return None
     else:
         places = [path.resolve().parent / name, path.resolve().parent / unquote(name)]
-    return next((one for one in places if one.is_file()), None)
+    return next((one for one in places if os.path.isfile(one)), None)  # noqa: PTH113 - no error

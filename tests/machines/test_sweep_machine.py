@@ -183,8 +183,10 @@ def test_a_joint_beyond_its_limits_is_told(env: Environment, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("q", "told"), [([[np.nan]], "row 0"), ([[1.0, 2.0]], "turn"), (np.zeros((0, 1)), "rows")]
-)
+    ("q", "told"),
+    [([[np.nan]], "row 0"), ([[1.0, 2.0]], "turn"), (np.zeros((0, 1)), "rows"),
+     ([[0.0], [1e300]], "row 1"), ([[1e16], [1e16 + 2.0]], "row 0")],
+)  # fmt: skip
 def test_values_that_are_none_are_refused(
     env: Environment,
     tmp_path: Path,
@@ -193,6 +195,11 @@ def test_values_that_are_none_are_refused(
 ) -> None:
     with pytest.raises(UsageError, match=told):
         sweep_machine(env, machine_of(tmp_path, *ARM), q)
+
+
+def test_a_machine_without_joints_is_refused(env: Environment, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no joints"):
+        sweep_machine(env, machine_of(tmp_path, ARM[1]), np.zeros((1, 0)))
 
 
 def random_machine(folder: Path, rng: np.random.Generator) -> Machine:
@@ -250,6 +257,6 @@ def test_bounds_of_the_motion_hold_for_random_machines(tmp_path: Path) -> None:
             corners += poses[:, None, :3, 3]
             speed = 400.0 * np.linalg.norm(np.diff(corners, axis=0), axis=2).max()
             bend = 400.0**2 * np.linalg.norm(np.diff(corners, n=2, axis=0), axis=2).max()
-            bounds = motion_bounds(machine, values, a, b)
+            bounds = motion_bounds(machine, values, a, b, machine.all_placed(values))
             assert speed <= bounds.speed[0] * (1.0 + 1e-9)
             assert bend <= bounds.bend[0] * (1.0 + 1e-6)

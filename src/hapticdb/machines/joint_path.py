@@ -29,6 +29,8 @@ MOST_TURN = 0.5
 """Greatest turn of a link between two poses, radians."""
 MOST_POSES = 1_000_000
 """Poses of a link's path. Larger: more memory, 0.1 GiB each million."""
+MOST_VALUE = 1e6
+"""Greatest value of a joint, rad or m. Larger: rounding has a part in the deviation."""
 _NAME = re.compile(r"(.*?)\s*(?:\[\s*(\S+)\s*\])?")
 _DEGREE = np.pi / 180.0
 
@@ -87,6 +89,8 @@ def checked_values(machine: Machine, q: ArrayLike) -> Floats:
     """Values (rows, joints) of all joints, two rows at least, for those of the driven ones."""
     given = as_floats(q, "a joint path")
     wanted = len(machine.driven)
+    if not machine.joints:
+        raise UsageError(f"{machine.file} has no joints: sweep its mesh as a tool")
     if given.ndim != 2 or given.shape[1] != wanted or not len(given):
         raise UsageError(
             f"a joint path of shape {given.shape}: give (rows, {wanted}), a column for each of "
@@ -95,7 +99,13 @@ def checked_values(machine: Machine, q: ArrayLike) -> Floats:
     bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
     if len(bad):
         raise UsageError(f"row {bad[0]} of the joint path has a value that is not finite")
-    return machine.values(given if len(given) > 1 else given[[0, 0]])
+    values = machine.values(given if len(given) > 1 else given[[0, 0]])
+    for row, n in np.argwhere(~(np.abs(values) <= MOST_VALUE)):
+        raise UsageError(
+            f"joint {machine.joints[n].name} is at {values[row, n]:.6g} in row {row} of the joint "
+            f"path: give {MOST_VALUE:.0e} rad or m at most"
+        )
+    return values
 
 
 def beyond_limits(machine: Machine, values: Floats) -> Iterable[str]:
@@ -113,7 +123,9 @@ def beyond_limits(machine: Machine, values: Floats) -> Iterable[str]:
 
 def joint_path(machine: Machine, values: Floats, pairs: Iterable[tuple[int, int]]) -> SampledPath:
     """Path over rows, its parameter the greatest motion of any link in the frame of another."""
-    speeds = [motion_bounds(machine, values, *pair).speed for pair in pairs]
+    placed = machine.all_placed(values)
+    with np.errstate(over="ignore", invalid="ignore"):
+        speeds = [motion_bounds(machine, values, *pair, placed).speed for pair in pairs]
     parameters = np.concatenate([[0.0], np.cumsum(np.max(speeds, axis=0))])
     if not np.isfinite(parameters[-1]):
         raise UsageError("the joint path is longer than numbers go: check its units")
@@ -126,7 +138,8 @@ def mover_of(
 ) -> Mover:  # fmt: skip
     """A link on its path in the frame of another one; base (4, 4) : `world_from_base`."""
     values, surface = path.poses, machine.surfaces[last]
-    _, bend, turn = motion_bounds(machine, values, first, last)
+    with np.errstate(over="ignore", invalid="ignore"):
+        _, bend, turn = motion_bounds(machine, values, first, last)
     counts = np.maximum(np.sqrt(bend / (8.0 * DEVIATION)), turn / MOST_TURN)
     counts = np.maximum(np.ceil(counts), 1.0)
     if not counts.sum() <= MOST_POSES:

@@ -1,6 +1,6 @@
 """Sweeps of machines along joint paths: links against objects, and links against links."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from os import PathLike
 
@@ -77,7 +77,7 @@ def sweep_machine(
     base = np.eye(4) if at is None else checked_poses(np.asarray(at)[None])[0]
     values = checked_values(machine, q)
     pairs, notes = _tested(machine, contact)
-    shown = values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)]
+    shown = machine.all_placed(values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)])
     pairs.sort(key=lambda pair: _gap(machine, pair, shown, np.inf))
     scene = [(0, link) for link in machine.surfaces]
     path = joint_path(machine, values, [*pairs, *scene])
@@ -98,7 +98,7 @@ def _tested(machine: Machine, contact: float) -> tuple[list[tuple[int, int]], li
     if machine.excluded is not None:
         names = machine.names
         return [(a, b) for a, b in pairs if {names[a], names[b]} not in machine.excluded], []
-    zero = machine.values(np.zeros((1, len(machine.driven))))
+    zero = machine.all_placed(machine.values(np.zeros((1, len(machine.driven)))))
     tested: list[tuple[int, int]] = []
     touching: list[tuple[int, int]] = []
     for a, b in pairs:
@@ -110,10 +110,12 @@ def _tested(machine: Machine, contact: float) -> tuple[list[tuple[int, int]], li
     ] if remarks else []
 
 
-def _gap(machine: Machine, pair: tuple[int, int], values: Floats, farthest: float) -> float:
-    """Least distance of two links at some values of the joints, infinite beyond the farthest."""
+def _gap(
+    machine: Machine, pair: tuple[int, int], placed: Mapping[int, Floats], farthest: float
+) -> float:
+    """Least distance of two links at some poses of all, infinite beyond the farthest."""
     a, b = pair
-    poses = np.linalg.inv(machine.placed(values, a)) @ machine.placed(values, b)
+    poses = np.linalg.inv(placed[a]) @ placed[b]
     tree = machine.surfaces[a].tree
     near = machine.surfaces[b].nearest(tree, poses, np.full(len(poses), farthest))
     return float(near.at_most.min())

@@ -47,13 +47,17 @@ class PagePerson:
     def wait_for(self, words: str) -> None:
         until(lambda: (self.look(0.05), any(words in text for text in self.received))[1])
 
-    def find(self, label: str) -> str:
-        """Id of the widget with that label; waits until the page has sent it."""
+    def find(self, label: str, option: str = "") -> str:
+        """Id of the widget with that label, or of a group with that option, once it is sent."""
         found: list[str] = []
 
         def is_there() -> bool:
             self.look(0.05)
-            found[:] = [u for u, one in self.widgets.items() if one.get("label") == label]
+            found[:] = [
+                u
+                for u, one in self.widgets.items()
+                if one.get("label") == label and (not option or option in one["options"])
+            ]
             return bool(found)
 
         until(is_there)

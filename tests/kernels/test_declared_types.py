@@ -34,6 +34,7 @@ for facet in facets:
     lines += ["endloop", "endfacet"]
 stl.write_text("\\n".join(lines + ["endsolid part", ""]))
 shell = hapticdb.PointShell.from_file(stl, points=300)
+quarter = np.eye(4)[[1, 0, 2, 3]] * [[-1.0], [1.0], [1.0], [1.0]]
 shell.save(folder / "shell.npz")
 loaded = hapticdb.PointShell.from_file(folder / "shell.npz")
 for n, (layout, curve) in enumerate(KINDS):
@@ -48,7 +49,7 @@ for n, (layout, curve) in enumerate(KINDS):
                 if env.has_distances and strategy != "statement":
                     env.touch(each, np.eye(4), strategy).contact_pairs
         env.calibrate()
-        hapticdb.sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4)])
+        hapticdb.sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), quarter, np.eye(4)])
         env.move(1, np.eye(4))
         env.voxels(1)
         env.remove(1)

@@ -50,7 +50,7 @@ def stored(admin: psycopg.Connection, url: str) -> list[object]:
 
 
 def take_the_wheel_out(person: PagePerson) -> None:
-    person.choose("Parts", "wheel")
+    person.put(person.find("", "wheel"), "wheel")
     person.choose("For everyone", "Take out")
 
 

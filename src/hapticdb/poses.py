@@ -127,7 +127,7 @@ def _read_array(path: str | os.PathLike[str], order: Order) -> NDArray[np.float6
     """Poses (M, 4, 4) of a .npy file; raises `FileError`."""
     try:
         found = as_floats(np.load(path, mmap_mode="c"), "poses")
-    except (OSError, ValueError) as error:
+    except (EOFError, OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise FileError(f"{path}: no .npy file of numbers: {why}") from None
     if found.shape[1:] not in {(4, 4), (7,)}:

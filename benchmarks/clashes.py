@@ -121,7 +121,7 @@ def measured(what: str, url: str) -> dict[str, Any]:
 def distance(
     a: CollisionShape, b: CollisionShape, pose: Floats, within: float, contact: float
 ) -> PairResult:
-    """Measure the distance of a pair and leave out its kind: in the place of `judge`."""
+    """Measure the distance of a pair and leave out its kind: in the place of `classify_pair`."""
     del contact
     near = nearest(a.tree, b.tree, pose[None], np.full(1, within))
     at_least, at_most = float(near.at_least[0]), float(near.at_most[0])

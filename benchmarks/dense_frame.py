@@ -40,7 +40,7 @@ def spread_out(keys: NDArray[np.int64], slots, words, side, bitmap):  # type: ig
 
 @leaf
 def dense_felt(bitmap, shell, pose, place, law, met, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
-    """One frame, as `felt`, under a law that reads no payload."""
+    """One frame, as `evaluate_frame`, under a law that reads no payload."""
     points = shell.points
     transform = transform_of(pose)
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side

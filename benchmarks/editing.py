@@ -23,7 +23,7 @@ RATE = 1000.0
 """Frames a second of the session."""
 LIFT = 5.0
 """Height in voxels by which the object is lifted."""
-GPU_QUERY = 0.0005
+LOOK = 0.0005
 """Seconds between two looks at the last frame: the resolution of the measured times."""
 PAUSE = 0.2
 """Seconds before each edit."""
@@ -105,7 +105,7 @@ def until_after(session: Session, revision: int) -> float:
     while revision_of(session) <= revision:
         if time.monotonic() > deadline:
             raise SystemExit(f"no frame has felt what came after revision {revision}")
-        time.sleep(GPU_QUERY)
+        time.sleep(LOOK)
     return time.monotonic()
 
 

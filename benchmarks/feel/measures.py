@@ -112,7 +112,7 @@ def table_of(cells: Sequence[Cell]) -> str:
         for key, one in MEASURES.items()
         if any(measure == key for measure, _ in found)
     ]
-    return table(["measure", "plane, direct", "distance", "wanted"], rows)
+    return table(["measure", "plane, direct", "distance, coupled", "wanted"], rows)
 
 
 def walls_of(cells: Sequence[Cell]) -> str:

@@ -42,7 +42,7 @@ laws.define(CopiedLaw, laws.LEAVES[DistanceFieldLaw])
 
 
 class Copied:
-    """The same, as a batch_tool takes it."""
+    """The same, as a batch tool takes it."""
 
     stiffness = 1000.0
     for_kernels = CopiedLaw(1000.0)

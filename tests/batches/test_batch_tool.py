@@ -1,4 +1,4 @@
-"""A batch_tool keeps cells from call to call, and feels the newest revision at each call."""
+"""A batch tool keeps cells from call to call, and feels the newest revision at each call."""
 
 from pathlib import Path
 

@@ -274,7 +274,7 @@ def test_nothing_is_felt_beyond_the_proved_distance() -> None:
     assert close < field.REACH
 
 
-# --- closed forms (physics.md) -------------------------------------------------------------------
+# --- closed forms --------------------------------------------------------------------------------
 
 PLANE_AT = 20.0
 

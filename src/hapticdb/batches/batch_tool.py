@@ -200,7 +200,7 @@ class BatchTool(Closes):
 
     def _in_snapshot(self, work: Callable[[], _Answer]) -> _Answer:
         if self._is_closed:
-            raise UsageError("this batch_tool is closed: make another by env.batch_tool")
+            raise UsageError("this batch tool is closed: make another by env.batch_tool")
         if self._is_torn:  # an error or Ctrl-C interrupted the reading of cells
             self._residency.reopened(self._store)
             self._known_revision = None

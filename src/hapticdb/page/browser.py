@@ -73,7 +73,7 @@ class Browser:
         """Whether the person has moved the hand."""
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY)
         self.works: list[Any] = []
-        """Long jobs of the panels, `panels.jobs.Work`."""
+        """Long jobs of the panels, `panels.jobs.PanelJob`."""
         self._begun: float | None = None
         self._keeps_tool: bool | None = None  # of the requested session; None: no request
         self._over: list[HostedSession] = []  # detached, to end

@@ -1,6 +1,6 @@
 """Relay between a browser's WebSocket and the page, message by message, within limits.
 
-From the browser only messages accepted by `messages.judged`, at the limits' rates; to the browser
+From the browser only messages accepted by `messages.validated`, at the limits' rates; to the browser
 everything, at its own rate.
 """
 

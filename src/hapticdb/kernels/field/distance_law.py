@@ -38,7 +38,7 @@ from hapticdb.kernels.force_law import Leaves, define
 ONSET = 1.5
 """delta, voxels: greatest distance of a point with a force.
 
-Trilinear distances are exact to 0.016 voxels down to 0.7 (physics.md), so the force is smooth for
+Trilinear distances are exact to 0.016 voxels down to 0.7, so the force is smooth for
 the first 0.8 voxels of depth. Larger: smoother deep forces, and contact earlier before the surface.
 """
 BLENDING = 1.0

@@ -42,7 +42,7 @@ def agree(squares, points, t):
 def search_kernel(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are untyped
     """CUDA kernel of the search, for blocks of so many threads (a power of two).
 
-    Its arguments: place; shell (6, N + 1), as in `frames`; poses (B, 4, 4), rigid; seen, of
+    Its arguments: place; shell (6, N + 1), as in `gpu_frames`; poses (B, 4, 4), rigid; seen, of
     `resident.cells.Seen`; reach, voxels; outputs: squares (B,) of distances, voxels, and points
     (B,).
     """

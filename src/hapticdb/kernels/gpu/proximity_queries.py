@@ -1,7 +1,7 @@
 """Proximity queries of the coupling on the GPU: `hand.near_points` for tools of any size.
 
 A query is two launches, replayed by a CUDA graph with fixed arguments, so its parameters are read
-from memory (`DeviceView.asked`). In the first launch a thread tests a run of points: is it due, and
+from memory (`DeviceView.query`). In the first launch a thread tests a run of points: is it due, and
 is its bounding sphere free? In the second a block processes a due run without a free sphere, a
 thread each point. Only near points are copied to the host, in any order, each with its number; the
 `due` values of points (see POINT) stay on the GPU. A query that ends early restores them beyond its

@@ -45,7 +45,7 @@ FLOOR = 1.0
 less smooth ones; below about 0.7 the gradients are wrong."""
 LEAST_BOUND = 0.1
 """Least lower bound of the distance, voxels: no step brings a point below it. Smaller: points get
-nearer to sheets; the proof in `path` needs a value above 0."""
+nearer to sheets; the proof in `advancement` needs a value above 0."""
 ENOUGH = 0.3
 """Lower bound of a near point, voxels, sufficient without the tighter `lower_bound`. Larger: fewer
 and longer advances in contact, and more computing for each point."""

@@ -2,7 +2,7 @@
 
 The tool has a pose and no velocity. Each period moves it to the minimum of the energy of the spring
 to the hand and of the contacts with the distance field (`step`), by Gauss-Newton steps under
-conservative advancement (`path`). The force on the hand is the spring's. So the stiffness at the
+conservative advancement (`advancement`). The force on the hand is the spring's. So the stiffness at the
 hand never exceeds the spring's, for any voxel size, number of points and contact stiffness.
 
 It needs resident cells with distances.
@@ -66,7 +66,7 @@ from hapticdb.kernels.hand.oscillation_guard import (
 from hapticdb.kernels.rigid import numbers_of, pose_of_quaternion
 
 IS_INSIDE, IS_SOFTER, IS_SNAPPING, IS_ANEW = 64, 128, 256, 512
-"""Marks of a period, besides those of `holding`: tool inside an obstacle, without contacts;
+"""Marks of a period, besides those of `fading`: tool inside an obstacle, without contacts;
 stiffness lowered by the guard; change of the force limited; cells changed."""
 
 STEPS = 3

@@ -211,7 +211,7 @@ def _weigh_by_distance(law, cells, points, transform, grid, scratch, count):  # 
 
 @inlined
 def _center_on_axis(origin, size, x):
-    """Coordinate of the voxel's centre at x, voxels, in metres, as in `contact.center_of`."""
+    """Coordinate of the voxel's centre at x, voxels, in metres, as in `shell_keys.center_of`."""
     return origin + size * (np.floor(x) + 0.5)
 
 

@@ -1,7 +1,7 @@
 """Kernels on pairs of surfaces: distances, on a path, too, and penetration depth.
 
-`pairs` measures two triangles, `nearest` two BVHs, `sweeping` two BVHs on a path; `depth` searches
-the deepest place of one surface in the closed bodies of another; `offsets` moves its
+`triangle_distance` measures two triangles, `surface_distance` two BVHs, `path_distance` two BVHs on
+a path, which `path_motion` moves; `depth` searches the deepest place of one surface in the closed bodies of another; `offsets` moves its
 corners.
 """
 

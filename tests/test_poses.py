@@ -202,7 +202,7 @@ def test_arrays_are_read(tmp_path: Path) -> None:
         with pytest.raises((FileError, UsageError), match=said):
             read_poses(path)
     path.write_bytes(b"")
-    with pytest.raises(FileError, match="no .npy file of numbers"):
+    with pytest.raises(FileError, match=r"no \.npy file of numbers"):
         read_poses(path)
     with pytest.raises(UsageError, match="wxyz or xyzw"):
         read_poses(path, order="zyxw")  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
 """Relay between a browser's WebSocket and the page, message by message, within limits.
 
-From the browser only messages accepted by `messages.validated`, at the limits' rates; to the browser
-everything, at its own rate.
+From the browser only messages accepted by `messages.validated`, at the limits' rates; to the
+browser everything, at its own rate.
 """
 
 import asyncio

@@ -2,8 +2,8 @@
 
 The tool has a pose and no velocity. Each period moves it to the minimum of the energy of the spring
 to the hand and of the contacts with the distance field (`step`), by Gauss-Newton steps under
-conservative advancement (`advancement`). The force on the hand is the spring's. So the stiffness at the
-hand never exceeds the spring's, for any voxel size, number of points and contact stiffness.
+conservative advancement (`advancement`). The force on the hand is the spring's. So the stiffness at
+the hand never exceeds the spring's, for any voxel size, number of points and contact stiffness.
 
 It needs resident cells with distances.
 """

@@ -107,7 +107,7 @@ class ToolPath(SampledPath):
         """
         degrees = np.degrees(np.linalg.norm(self.motion.turns, axis=1))
         n = int(np.argmax(degrees))
-        steps = f"from pose {n} to pose {n + 1} the path turns by {degrees[n]:.4g} degrees"
+        steps = f"from pose {n} to pose {n + 1} the path turns by {degrees[n]:.5g} degrees"
         if degrees[n] > HALF_TURN:
             raise UsageError(f"{steps}, either way: give a pose between")
         if degrees[n] >= MUCH:

@@ -173,7 +173,7 @@ def test_a_turn_and_a_path_say_when_parts_meet(run: Run, tmp_path: Path) -> None
     refused(run("clashes", path, "--turn", "z"), "--of")
     for more in ("--least-volume 1", "--all", "--within 2", "--budget 9", "--junit a.xml"):
         words = ("--of", "cube0", "--turn", "z", *more.split())
-        refused(run("clashes", path, *words), more.split()[0], "with --poses and --turn")
+        refused(run("clashes", path, *words), more.split()[0], "with --poses or --turn")
     for more in ("--from 1", "--about 0,0,0"):
         refused(run("clashes", path, *more.split()), more.split()[0], "without --poses")
     refused(run("clashes", path, "--of", "cube0", "--turn", "w"), "--turn x, y or z")

@@ -149,6 +149,15 @@ def test_a_mocap_body_stands_where_the_file_has_it(tmp_path: Path) -> None:
     assert machine.placed(np.zeros((1, 1)), link)[0, :3, 3].tolist() == [0.0, 0.0, 9.0]
 
 
+@pytest.mark.filterwarnings("ignore:.*NaN")
+@pytest.mark.parametrize("number", ["inf", "nan"])
+def test_a_place_without_a_finite_number_is_refused(tmp_path: Path, number: str) -> None:
+    text = f'<body name="m" pos="{number} 0 0"><joint/><geom size="0.1"/></body>'
+    (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
+    with pytest.raises(FileError, match="finite"):
+        read_machine(tmp_path / "m.xml")
+
+
 def test_an_srdf_file_names_the_pairs_that_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "m.xml").write_text(ARM)
     (tmp_path / "m.srdf").write_text(

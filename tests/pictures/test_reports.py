@@ -164,5 +164,5 @@ def test_reports_are_refused_where_they_cannot_be(run: Run, hall: Path, tmp_path
     (tmp_path / "a.xml").touch()
     refused(run("clashes", hall, "--junit", tmp_path / "a.xml"), "--junit", "not there yet")
     moving = ("--of", "1", "--turn", "z", "--bcf", "a.bcfzip")
-    refused(run("clashes", hall, *moving), "--poses and --turn")
+    refused(run("clashes", hall, *moving), "--poses or --turn")
     assert not (tmp_path / "a.bcfzip").exists()

@@ -1,5 +1,6 @@
 """MJCF, compiled by MuJoCo: a body without joints belongs to the link of its parent."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,13 @@ def machine_of_mjcf(path: Path) -> Machine:
         import mujoco  # noqa: PLC0415 - an extra
     except ImportError:
         raise MissingExtraError(f"MJCF needs MuJoCo: {pip_line('machines')}") from None
+    mujoco.set_mju_user_warning(lambda text: warnings.warn(f"{path}: {text}", stacklevel=1))
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise FileError(f"{path}: {' '.join(str(error).split())}") from None
+    finally:
+        mujoco.set_mju_user_warning(None)
     return _Reading(path, model, mujoco).machine()
 
 

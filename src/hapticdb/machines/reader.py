@@ -5,6 +5,8 @@ from os import PathLike
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+import numpy as np
+
 from hapticdb.errors import FileError
 from hapticdb.machines.machine import Machine
 from hapticdb.machines.urdf import machine_of_urdf
@@ -35,6 +37,12 @@ def read_machine(path: str | PathLike[str], srdf: str | PathLike[str] | None = N
         raise FileError(f"{path}: its root is <{root.tag[:40]}>: give a URDF or MJCF file")
     if not machine.surfaces:
         raise FileError(f"{path}: none of its links has a surface")
+    for link, surface in machine.surfaces.items():
+        if not np.isfinite(surface.box).all():
+            raise FileError(f"{path}: link {machine.names[link]}: a place is not a finite number")
+    for joint in machine.joints:
+        if not all(np.isfinite(one).all() for one in (joint.origin, joint.axis, joint.point)):
+            raise FileError(f"{path}: joint {joint.name}: a place is not a finite number")
     return machine if srdf is None else replace(machine, excluded=_pairs_of(Path(srdf), machine))
 
 

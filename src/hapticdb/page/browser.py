@@ -71,7 +71,7 @@ class Browser:
         self.hand = self._start()
         self.has_moved = False
         """Whether the person has moved the hand."""
-        self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY)
+        self.history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
         self.works: list[Any] = []
         """Long jobs of the panels, `panels.jobs.PanelJob`."""
         self._begun: float | None = None
@@ -359,8 +359,8 @@ class Browser:
             points if one["contacts"] else points[:0], colours.of_contacts(points, touched)
         )
         self._begun = now if self._begun is None else self._begun
-        force = float(np.linalg.norm(wrench[:3]))
-        self.history.append((now - self._begun, force))
+        force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1).tolist()
+        self.history.append((now - self._begun, force, torque))
         self.frame_came(one, wrench, touched, now)
 
     def _plumb(self, now: float) -> None:

@@ -132,11 +132,11 @@ def clashes(
         _say_accepted([(row.a, row.b) for row in rows], because, output)
         return
     if motion.poses is not None or motion.turn is not None:
-        refuse("with --poses and --turn", pairs, "within seconds budget on")
-        refuse("with --poses and --turn", meant)
-        refuse("with --poses and --turn", output, "html junit bcf")
+        refuse("with --poses or --turn", pairs, "within seconds budget on")
+        refuse("with --poses or --turn", meant)
+        refuse("with --poses or --turn", output, "html junit bcf")
         _moved(url, pairs, motion, output)
-    refuse("without --poses and --turn", motion)
+    refuse("without --poses or --turn", motion)
     from hapticdb.clashes.clash_results import DEFAULT_KINDS, PAIR_KEYS
     from hapticdb.clashes.rules import add_rules
     from hapticdb.clashes.search import accept_pairs

@@ -201,11 +201,11 @@ class TouchPanel:
 
 
 def last_seconds(history: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows (n, 2) of the last `SECONDS`: time before now, force; 0 N before the first sample."""
+    """Rows (n, 3) of the last `SECONDS`: time before now, force, torque; 0 before the first."""
     rows = history.copy()
     rows[:, 0] -= history[-1, 0]
     rows = rows[rows[:, 0] >= -SECONDS]
-    return np.vstack([[-SECONDS, 0.0], [rows[0, 0], 0.0], rows])
+    return np.vstack([[-SECONDS, 0.0, 0.0], [rows[0, 0], 0.0, 0.0], rows])
 
 
 def _css(colour: colours.Colour) -> str:
@@ -213,17 +213,24 @@ def _css(colour: colours.Colour) -> str:
 
 
 def _plot(gui: "GuiApi", *, is_seen: bool) -> "GuiUplotHandle":
-    """Add the plot of the force."""
+    """Add the plot of force and torque, each on an axis of its own."""
     from viser.uplot import Axis, Legend, Scale, Series  # noqa: PLC0415 - the extra `view`
 
     return gui.add_uplot(
-        (np.array([-SECONDS, 0.0]), np.zeros(2)),
-        (Series(label="s"), Series(label="N", stroke=_css(colours.FORCE), width=2)),
-        title="Force, N",
+        (np.array([-SECONDS, 0.0]), np.zeros(2), np.zeros(2)),
+        (
+            Series(label="s"), Series(label="N", stroke=_css(colours.FORCE), width=2),
+            Series(label="N m", stroke=_css(colours.TORQUE), width=2, scale="torque"),
+        ),
+        title="Force, N (left); torque, N m (right)",
         scales={
             "x": Scale(time=False, min=-SECONDS, max=0.0),
             "y": Scale(auto=False, min=0.0, max=HIGHEST),
+            "torque": Scale(auto=True),
         },
-        axes=(Axis(space=60, size=32), Axis(size=40)),
+        axes=(
+            Axis(space=60, size=32), Axis(size=40),
+            Axis(size=46, scale="torque", side=1, grid={"show": False}),
+        ),
         legend=Legend(show=False), height=130, visible=is_seen,
     )  # fmt: skip

@@ -188,9 +188,11 @@ class ResidentCells(Closes):
 
     @property
     def database_lost(self) -> str | None:
-        """One line: why the database cannot be read now; None while it can. As of `supervise`."""
+        """One line: why the database cannot be read now; None while it can."""
         control = self.table.cells.control
         if control["is_lost"]:
+            with self._supervising, suppress(HapticDBError):
+                self._take_messages()  # the cause was sent before the mark was set
             return self._lost_by or f"{redact(self.url)} does not answer"
         if time.monotonic_ns() - int(control["heartbeat"]) > SILENCE_NS:
             return f"{redact(self.url)} has not answered for {1e-9 * SILENCE_NS:g} s"

@@ -46,9 +46,11 @@ else:
         pairs = []
         for first in FIRST_OF_PAIRS:
             where = builder.gep(data, [builder.add(at, ir.Constant(at.type, first))])
+            # one load for both k; align 1, since a pair may begin at any byte
             pairs.append(builder.load(builder.bitcast(where, pair.as_pointer()), align=1))
         front = _shuffled(builder, pairs[0], pairs[1], range(4))
         back = _shuffled(builder, pairs[2], pairs[3], range(4))
+        # k apart: the first interpolation then runs on two vectors of four
         steps = _shuffled(builder, front, back, (0, 2, 4, 6, 1, 3, 5, 7))
         most = ir.Constant(eight, [STEPS] * 8)
         steps = builder.select(builder.icmp_unsigned("<", steps, most), steps, most)

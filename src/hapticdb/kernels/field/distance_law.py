@@ -105,6 +105,7 @@ def _least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
     x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
     # unsigned: a signed index is tested for a negative value at each of the 8 reads
     at = np.uint64(row_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k))
+    # minimum at each centre before the interpolation, as cells store it
     q000 = q001 = q010 = q011 = q100 = q101 = q110 = q111 = np.int64(STEPS)
     for signed in range(first, end):
         if counts[signed]:
@@ -134,6 +135,7 @@ def _least_of_cell(payload, slot, x, y, z, i, j, k):
     """U at a point in the cell with first voxel (i, j, k), or under 1/2 voxel outside it."""
     x0, y0, z0 = math.floor(x - 0.5), math.floor(y - 0.5), math.floor(z - 0.5)
     at = cell_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k)
+    # BEYOND counts as h, as in the rows
     q000 = min(np.int64(payload[slot, at]), STEPS)
     q001 = min(np.int64(payload[slot, at + 1]), STEPS)
     q010 = min(np.int64(payload[slot, at + CELL_SIDE]), STEPS)
@@ -169,6 +171,7 @@ def _share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample
     """Share g, 0 to 1, by the distances of rows first .. end - 1."""
     ahead = _least_of_brick(
         payload, counts, first, end, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
+        # brick of the point itself: its row has a layer for the place ahead
         np.int64(x) & -8, np.int64(y) & -8, np.int64(z) & -8,
     )  # fmt: skip
     return agreement(sample, ahead)
@@ -178,6 +181,7 @@ def _share_of_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noqa: AR
     """Share g, 0 to 1, by the distances of a slot's cell."""
     ahead = _least_of_cell(
         payload, slot, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
+        # cell of the point itself, as in `_share_of_rows`
         np.int64(x) & -32, np.int64(y) & -32, np.int64(z) & -32,
     )  # fmt: skip
     return agreement(sample, ahead)

@@ -36,6 +36,7 @@ def step_of(distance):
     """Stored value of a distance in voxels."""
     if distance > HALF_WIDTH:
         return BEYOND
+    # to nearest: LARGEST_ERROR is half a step
     return int(distance / VOXELS_A_STEP + 0.5)
 
 
@@ -60,6 +61,7 @@ def place_before(x, y, z):
 @leaf
 def trilinear(u000, u001, u010, u011, u100, u101, u110, u111, x, y, z):
     """Trilinear interpolation between 8 corners; x, y, z in [0, 1] from corner 000."""
+    # this order of operations is fixed: `corners.interpolated` repeats it bit for bit
     u00 = u000 + z * (u001 - u000)
     u01 = u010 + z * (u011 - u010)
     u10 = u100 + z * (u101 - u100)

@@ -39,6 +39,7 @@ def unpack_kernel(data, out):
                 byte = np.int64(data[at + np.uint64(4) * half + n])
                 mask |= byte << np.int64(np.uint64(8) * n)
             while mask:
+                # tested at each byte: a damaged mask may ask for more than there are
                 if follow == end:
                     return np.int64(-1)
                 place = np.uint64(32) * half + np.uint64(lowest_bit(mask))

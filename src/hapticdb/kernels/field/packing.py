@@ -71,6 +71,7 @@ def _put_bits(out, at, buffer, n_buffered, value, n):
     """Append the n bits of value to the bit buffer `buffer`; 32 of them move to out[at ...]."""
     buffer |= value << n_buffered
     n_buffered += n
+    # at most 31 bits stay, so a code of 12 more fits the 64-bit buffer
     if n_buffered >= np.uint64(32):
         for _ in range(4):
             out[at] = buffer & np.uint64(255)
@@ -92,6 +93,7 @@ def _set_residuals(values, n, padded, residuals):
 
     padded, residuals (11^3,) uint8. One loop without branches, which LLVM vectorises.
     """
+    # the padding stays BEYOND: the predictor reads 255 outside the row without a test
     for line in range(LINES):
         to = _place_padded(line)
         for z in range(ROW_SIDE):
@@ -101,6 +103,7 @@ def _set_residuals(values, n, padded, residuals):
         here = np.int64(padded[at]) - padded[at - 1] - padded[at - y] + padded[at - y - 1]
         back = np.int64(padded[at - x]) - padded[at - x - 1]
         back = back - padded[at - x - y] + padded[at - x - y - 1]
+        # padding between lines gets residuals, too: unread, and cheaper than a branch
         residuals[at] = (here - back) & 255
 
 
@@ -120,6 +123,7 @@ def _put_mask(out, at, buffer, n_buffered, mask, back, up):
     """Append a line's mask, given those of the plane before and of the line before."""
     if mask == back:
         return _put_bits(out, at, buffer, n_buffered, NONE, ONE)
+    # with equal predictions the second bit would carry nothing
     if back == up:
         return _put_bits(out, at, buffer, n_buffered, (mask << ONE) | ONE, np.uint64(11))
     if mask == up:
@@ -135,7 +139,7 @@ def _put_residuals(out, at, buffer, n_buffered, residuals, line, mask):
     first = np.uint64(_place_padded(line))
     while mask:
         residual = residuals[first + np.uint64(lowest_bit(np.int64(mask)))]
-        mask &= mask - ONE
+        mask &= mask - ONE  # clear the lowest set bit
         code, n = CODES[0, residual], CODES[1, residual]
         at, buffer, n_buffered = _put_bits(out, at, buffer, n_buffered, code, n)
     return at, buffer, n_buffered
@@ -157,6 +161,7 @@ def _pack_row(masks, residuals, out, at):
     for first in range(0, LINES, ROW_SIDE):
         is_same = _is_like_before(masks, first)
         at, buffer, n_buffered = _put_bits(out, at, buffer, n_buffered, np.uint64(is_same), ONE)
+        # prediction starts anew in each plane: `up` is the line before in the same plane
         up = NONE
         for line in range(first, first + ROW_SIDE):
             mask = masks[line]
@@ -182,6 +187,7 @@ def pack_kernel(values, first, ends, out):
     ends (P,) sets the number of rows, and receives their ends in out, which has room for P times
     `MOST_ROW_BYTES`.
     """
+    # filled once: a row overwrites its own values alone, never the padding
     padded = np.full(PADDED**3, BEYOND, np.uint8)
     residuals = np.empty(PADDED**3, np.uint8)
     masks = np.empty(LINES, np.uint64)
@@ -207,6 +213,7 @@ def _bits_at(row, at):
 @leaf
 def added(a, b):
     """Bytewise sum of eight bytes in a and in b, each modulo 256."""
+    # SWAR: carries stop at bit 7, whose sum is an XOR
     return ((a & LOW_BITS) + (b & LOW_BITS)) ^ ((a ^ b) & ~LOW_BITS)
 
 
@@ -245,6 +252,7 @@ def _take_line(row, at, mask):
         at += n + np.uint64(3)
         half = (number + ONE) >> ONE
         total += half if number & ONE else np.uint64(256) - half  # modulo 256
+        # prefix sum by broadcast: the running total fills the line from z to its end
         from_here = (total & np.uint64(255)) * EACH_BYTE
         if z < np.uint64(8):
             place = z << np.uint64(3)
@@ -274,6 +282,7 @@ def _unpack_row(row, masks, lines, out, n):
     """
     for y in range(ROW_SIDE):
         masks[y] = NONE
+        # inverse Lorenzo: sums along k in `_take_line`, along j in low and high, along i in `lines`
         lines[2 * y], lines[2 * y + 1] = ALL_BEYOND, ALL_BEYOND
     at = place = some = NONE
     for _ in range(ROW_SIDE):
@@ -286,7 +295,7 @@ def _unpack_row(row, masks, lines, out, n):
             if has_residuals:
                 if not is_same:
                     up, at = _take_mask(row, at, masks[y], up)
-                    masks[y] = up
+                    masks[y] = up  # the next plane's prediction, and the next line's
                 if masks[y]:
                     some |= masks[y]
                     low_more, high_more, at = _take_line(row, at, masks[y])
@@ -301,6 +310,7 @@ def _unpack_row(row, masks, lines, out, n):
 @maker
 def unpacking_memory():
     """Scratch of `unpack_one`."""
+    # 4 spare bytes: `_bits_at` reads a whole word at the last bit
     row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)
     return row, np.empty(ROW_SIDE, np.uint64), np.empty(2 * ROW_SIDE, np.uint64)
 
@@ -314,12 +324,15 @@ def unpack_one(data, ends, n, memory, out, to):
     row, masks, lines = memory
     start = ends[n - 1] if n else np.int64(0)
     size = ends[n] - start
+    # before any access: `ends` may be damaged as well
     if start < 0 or size < 1 or size > MOST_ROW_BYTES or ends[n] > data.shape[0]:
         return False
     first = np.uint64(start)
+    # copied: bytes behind the row's end are inside this buffer, whatever the bits say
     for byte in range(np.uint64(size)):
         row[byte] = data[first + byte]
     n_bits = _unpack_row(row, masks, lines, out, np.uint64(to))
+    # sound only if the bits end in the last byte, with zeros behind them
     return (n_bits + 7) >> 3 == size and np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1) == 0
 
 
@@ -350,6 +363,7 @@ def pack(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64
     for first in range(0, len(rows), ROWS_AT_ONCE):
         some = ends[first : first + ROWS_AT_ONCE]
         size = pack_kernel(rows, first, some, out)
+        # `some` is a view: it turns the batch's ends into the whole data's
         some += n_bytes
         n_bytes += size
         pieces.append(out[:size].copy())

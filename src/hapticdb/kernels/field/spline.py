@@ -71,6 +71,7 @@ def spline(payload, slot, x, y, z):
     bx, hx, ax = _spline_weights(tx)
     by, hy, ay = _spline_weights(ty)
     bz, hz, az = _spline_weights(tz)
+    # quadratic B-spline: 27 centres, also across the cell's border by the layer of the payload
     at = cell_place((np.int64(x) & 31) - 1, (np.int64(y) & 31) - 1, (np.int64(z) & 31) - 1)
     v0, y0, z0 = _plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz)
     v1, y1, z1 = _plane_of_nine(payload, slot, at + ALONG_I, by, hy, ay, ty, bz, hz, az, tz)
@@ -121,6 +122,7 @@ def second_derivatives(payload, slot, x, y, z):
 def lower_bound(payload, slot, x, y, z):
     """Lower bound of the distance at a point of the slot's cell, voxels, by its 8 centres."""
     tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
+    # index of the lower centre of the 8 around the point
     bx, by, bz = np.int64(tx < 0.0), np.int64(ty < 0.0), np.int64(tz < 0.0)
     at = cell_place((np.int64(x) & 31) - bx, (np.int64(y) & 31) - by, (np.int64(z) & 31) - bz)
     lx, ly, lz = tx + bx, ty + by, tz + bz
@@ -134,7 +136,9 @@ def lower_bound(payload, slot, x, y, z):
         square += uz if corner & 1 else lz
         index = at + (corner >> 2) * ALONG_I + ((corner >> 1) & 1) * ALONG_J + (corner & 1)
         u = float(min(payload[slot, index], STEPS)) * VOXELS_A_STEP
+        # distance is 1-Lipschitz: each centre bounds the point by itself, and the best one wins
         best = max(best, u - math.sqrt(square))
+    # half a step for the rounding of the stored distance
     return max(best - 0.5 * VOXELS_A_STEP, 0.0)
 
 
@@ -155,4 +159,5 @@ def bound_in_free_block(x, y, z, bits):
     """
     side = float(1 << bits)
     x, y, z = x % side, y % side, z % side
+    # to the block's border, half a voxel more to the grown block, then its own free margin
     return min(x, side - x, y, side - y, z, side - z) + 0.5 + FREE_BEYOND

@@ -54,6 +54,7 @@ def shares_of(n_points: int) -> tuple[int, int]:
 def _slot_at(keys, slots, side, i, j, k):
     """Slot of the cell of voxel (i, j, k): by an array of all cells, or by the hash directory."""
     if keys.shape[1] == 1:
+        # dense array of all cells where it fits: one load instead of a probe
         n = (np.int64(side) + 31) >> 5
         return slots[0, ((i >> 5) * n + (j >> 5)) * n + (k >> 5)]
     return np.int32(_slot_of(keys, slots, 0, _cell_key(i, j, k)))
@@ -92,6 +93,7 @@ def _adding_under(law_type: type) -> Callable[..., Any]:
             if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
                 continue
             i, j, k = np.int64(x), np.int64(y), np.int64(z)
+            # gates in the order of cost: directory, one bit, then the distance
             slot = _slot_at(keys, slots, side, i, j, k)
             if slot <= cells.EMPTY_SLOT:
                 sums[UNKNOWNS] += slot < 0
@@ -127,6 +129,7 @@ def _adding_under(law_type: type) -> Callable[..., Any]:
 @cuda.jit(device=True)
 def _add_up(both, t):
     """Tree reduction of both (SUMS, threads) into column 0: sums, and the maximum of DEEPEST."""
+    # no atomic additions: the order is fixed, so are the sums from run to run
     cuda.syncthreads()
     half = both.shape[1] // 2
     while half > 0:
@@ -181,11 +184,13 @@ def frames_under(law_type: type, threads: int, *, single: bool) -> Any:  # noqa:
             if shares > 1:
                 for row in range(t, SUMS, threads):
                     sums[n, block, row] = both[row, 0]
+                # the shares are in global memory before the counter says so
                 cuda.threadfence()
                 cuda.syncthreads()
                 if t == 0:
                     n_ended[0] = cuda.atomic.add(ended, n, 1)
                 cuda.syncthreads()
+                # the last block to finish adds all shares: no second launch
                 if n_ended[0] < shares - 1:
                     continue
                 for row in range(SUMS):
@@ -197,7 +202,7 @@ def frames_under(law_type: type, threads: int, *, single: bool) -> Any:  # noqa:
                             both[row, t] += sums[n, one, row]
                 _add_up(both, t)
             if t == 0:
-                ended[n] = 0
+                ended[n] = 0  # ready for the next launch
                 _write(both[:, 0], n, total, out)
                 if not single and not _is_rigid(poses[n]):
                     out[UNKNOWNS * total + n] = NOT_RIGID

@@ -65,7 +65,9 @@ def search_kernel(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are un
                         best[t], nearest[t] = -1.0, np.int64(UNDECIDED)
                     elif voxel >= 0:
                         best[t], nearest[t] = found, np.int64(at)
+                # also by threads without a point: the barriers inside need the whole block
                 agree(best, nearest, t)
+                # every thread reads the result before the next point overwrites it
                 square, point = best[0], nearest[0]
                 cuda.syncthreads()
             if t == 0:

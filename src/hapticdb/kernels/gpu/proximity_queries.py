@@ -77,6 +77,7 @@ def list_due_runs(grid, seen, view):
     least, query = NEVER, view.query[0]
     transform = _transform_of(query.pose)
     for run in range(cuda.grid(1), view.run_due.shape[0], cuda.gridsize(1)):
+        # the old value is kept: `put_back` undoes the query beyond a refusal
         before = -NEVER if query.is_anew else view.run_due[run]
         if query.travelled < before:
             least = min(least, before)
@@ -89,6 +90,7 @@ def list_due_runs(grid, seen, view):
                 least = min(least, query.travelled + rest)
                 continue
         view.due_runs[np.int64(cuda.atomic.add(view.found, DUE_RUNS, 1.0))] = run
+    # once a thread: the local minimum spares an atomic operation for each run
     cuda.atomic.min(view.found, LEAST, least)
 
 
@@ -97,6 +99,7 @@ def _miss(missed, key):
     """Add an unknown cell to the hash set `missed`, if absent and there is room."""
     at = _spread(key, ROOM_FOR_MISSED)
     for _ in range(ROOM_FOR_MISSED):
+        # a free place is claimed atomically: two threads may miss the same cell
         before = cuda.atomic.cas(missed, at, -1, key)
         if before in (-1, key):
             return
@@ -140,6 +143,7 @@ def _query_point(n, grid, query, transform, seen, payload, view):
     sample = _distance_at(payload, slot, mask, inside)
     u, bound = sample[0], sample[4]
     if u < ONSET + MARGIN or bound < LEAST_BOUND:
+        # counted even without room: the host sees how many there were
         at = np.int64(cuda.atomic.add(view.found, NEARS, 1.0))
         if at < view.points_near.shape[0]:
             cx, cy, cz = _moved(transform, points[0, center], points[1, center], points[2, center])
@@ -164,15 +168,18 @@ def query_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are untyp
         transform = _transform_of(query.pose)
         for at in range(cuda.blockIdx.x, np.int64(view.found[DUE_RUNS]), cuda.gridDim.x):
             run, least = view.due_runs[at], NEVER
+            # a new epoch voids all `due` at once, without a write to each point
             is_known, start = view.epochs[run] == query.epoch, run * query.run
             for n in range(start + t, min(start + query.run, n_points), threads):
                 due = view.due[n] if is_known else -NEVER
+                # also of points that are not due: `put_back` restores the run as a whole
                 view.due_before[n] = due
                 if query.travelled >= due:
                     due = _query_point(n, grid, query, transform, seen, payload, view)
                     view.due[n] = due
                 least = min(least, due)
             best[t], nobody[t] = least, 0
+            # block-wide: the loop's bounds are the same for all threads, so each meets the barrier
             agree(best, nobody, t)
             if t == 0:
                 view.epochs[run], view.run_due[run] = query.epoch, best[0]

@@ -32,6 +32,7 @@ def _as_python(function: Callable[..., Any]) -> Callable[..., Any]:
         for name in plain.__code__.co_names
         if isinstance(plain.__globals__.get(name), Dispatcher)
     }
+    # a copy with its own globals: the module keeps its compiled leaves
     scope = plain.__globals__ | called
     return FunctionType(
         plain.__code__, scope, plain.__name__, plain.__defaults__, plain.__closure__

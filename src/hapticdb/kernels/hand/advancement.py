@@ -63,6 +63,7 @@ def place_on_step(tool, center, follower, done):
 @leaf
 def step_bound(follower, radius, size):
     """Upper bound of any point's path length in the whole step, voxels; radius, size : m."""
+    # screw motion: |v| + r |w| bounds the arc length at any radius up to r
     return (length_at(follower.step, 0) + radius * length_at(follower.step, 3)) / size
 
 
@@ -73,14 +74,17 @@ def _advance_once(query, path_length, done, tool):
     SHUT : even the shortest advance is blocked, or the period has no queries left.
     """
     follower = query.follower
+    # conservative advancement: the least clearance bounds the motion of every point
     stride = min(
         1.0 - done, STRIDE * max(follower.clearance, LEAST_STRIDE) / max(path_length, 1e-300)
     )
     part = stride
+    # refused below FLOOR or LEAST_BOUND, stricter than the proof: halve towards the obstacle
     while part >= SHORTEST * stride and follower.n_queries < MOST_QUERIES:
-        end = 1.0 if part >= 1.0 - done else done + part
+        end = 1.0 if part >= 1.0 - done else done + part  # exactly 1: the caller's loop ends
         place_on_step(tool, query.shell.center, follower, end)
         passed = path_length * (end - done)
+        # from a refused pose the path leads back to the tool's pose first
         found = query_proximity(query, tool.tried_pose, follower.astray + passed, np.bool_(True))
         follower.astray = passed
         if found == OPEN:
@@ -110,8 +114,10 @@ def advance_step(query, radius, tool):
     follower = query.follower
     path_length = step_bound(follower, radius, query.grid.size)
     done, found = 0.0, OPEN
+    # shares refer to the pose at the start of the step: it is unchanged until the end
     while done < 1.0 and found == OPEN:
         done, found = _advance_once(query, path_length, done, tool)
     if done > 0.0:
+        # again, since `tried_pose` may be a refused pose beyond `done`
         set_pose(tool, follower, place_on_step(tool, query.shell.center, follower, done))
     return done, found

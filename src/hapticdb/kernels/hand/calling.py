@@ -53,6 +53,7 @@ else:
             kinds, calls = signature.args[1:], context.call_conv
             kind = calls.get_function_type(signature.return_type, kinds)
             kernel = builder.inttoptr(arguments[0], kind.as_pointer())
+            # numba's own calling convention: the status carries an exception of the callee
             status, result = calls.call_function(
                 builder, kernel, signature.return_type, kinds, arguments[1:]
             )

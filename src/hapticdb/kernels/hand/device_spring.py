@@ -68,12 +68,13 @@ def measure_pull(spring, tool, hand, pose, center, follower):
     p, q = tool.quaternion, hand.quaternion
     for axis in range(3):
         pull[axis] = at_hand[axis] + lever[axis] - at[axis]
-    turned = product(q[0], q[1], q[2], q[3], p[0], -p[1], -p[2], -p[3])
+    turned = product(q[0], q[1], q[2], q[3], p[0], -p[1], -p[2], -p[3])  # q p*: from tool to hand
     pull[3], pull[4], pull[5] = turn_of(*turned)
     stiffness = follower.share * spring.stiffness / spring.scale
     turn_stiffness = follower.share * spring.turn_stiffness * spring.scale
     most, most_turn = BEYOND_CAP * spring.cap, BEYOND_CAP * spring.turn_cap * spring.scale
     distance, angle = length_at(pull, 0), length_at(pull, 3)
+    # secant stiffness beyond the cap: the gradient of the linear part of psi at this stretch
     follower.pulls[0] = most / distance if stiffness * distance > most else stiffness
     follower.pulls[1] = most_turn / angle if turn_stiffness * angle > most_turn else turn_stiffness
 
@@ -89,6 +90,7 @@ def lever_in_hand(hand, center):
 def at_device(spring, hand, center, fx, fy, fz, tx, ty, tz):
     """Wrench about the tool's centre (3,) in the hand: at the device, about the handle's origin."""
     rx, ry, rz = lever_in_hand(hand, center)
+    # the handle's origin is not the tool's centre: moment of the force about the origin
     mx, my, mz = moment(rx, ry, rz, fx, fy, fz)
     return (
         fx, fy, fz, (tx + mx) / spring.scale, (ty + my) / spring.scale, (tz + mz) / spring.scale,

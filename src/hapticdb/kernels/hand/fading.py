@@ -56,6 +56,7 @@ def begin_anew(tool):
 def place_lost(tool, hand, is_hand):
     """Reset a tool with a non-finite state; it moves to the hand if `is_hand`."""
     is_placed = is_finite(tool.position) and is_finite(tool.quaternion)
+    # all that feeds back from period to period: one NaN would stay for ever
     if is_placed and is_finite(tool.kept) and math.isfinite(tool.held_for):
         return
     begin_anew(tool)
@@ -88,11 +89,14 @@ def _share_of_wrench(terms, tool, hand, is_held, dt):
         tool.held_for += dt
         faded = _faded_share(terms, tool.held_for)
     else:
+        # the rise begins at the faded level, so the first new wrench does not jump
         tool.risen *= 1.0 - _faded_share(terms, tool.held_for)
         tool.held_for = 0.0
         if not hand.is_open:
+            # bounded per frame as well: dt of a long period would allow the whole rise at once
             tool.risen = min(tool.risen + min(passed, 1.0 / RISE_FRAMES), 1.0)
     if hand.is_open:
+        # open clutch: the fall works beside that of lost cells
         tool.risen = max(tool.risen - passed, 0.0)
     return (1.0 - faded) * tool.risen, faded > 0.0
 

@@ -18,7 +18,7 @@ def _add_row(follower, weight, depth, along, about):
     row = along[0], along[1], along[2], about[0], about[1], about[2]
     for n in range(6):
         weighed = weight * row[n]
-        for m in range(n + 1):
+        for m in range(n + 1):  # lower triangle: symmetric
             matrix[n, m] += weighed * row[m]
         right[n] += weighed * depth
 
@@ -33,6 +33,7 @@ def _factor(follower):
             for n in range(column):
                 total -= matrix[row, n] * matrix[column, n]
             if row == column:
+                # the springs make the matrix positive definite: the guard is against rounding alone
                 matrix[row, row] = math.sqrt(max(total, 1e-300))
             else:
                 matrix[row, column] = total / matrix[column, column]
@@ -63,6 +64,7 @@ def _begin_equations(follower, extra, turn_extra):
         for column in range(row):
             matrix[row, column] = 0.0
     for axis in range(3):
+        # brake on the left side alone (Levenberg-Marquardt): shorter steps, same equilibrium
         matrix[axis, axis] = pulls[0] + extra
         matrix[3 + axis, 3 + axis] = pulls[1] + turn_extra
         right[axis] = pulls[0] * pull[axis]
@@ -119,6 +121,7 @@ def solve_step(query, stiffness, extra, turn_extra, rounds):
     follower.n_bends = 0
     for axis in range(6):
         follower.step[axis] = 0.0
+    # active set method, begun at step 0 with the present contacts
     _predict_contacts(query)
     for _ in range(rounds):
         _begin_equations(follower, extra, turn_extra)
@@ -126,12 +129,13 @@ def solve_step(query, stiffness, extra, turn_extra, rounds):
             one = near[m]
             if not one.is_active:
                 continue
-            depth = depth_of(query, one)
+            depth = depth_of(query, one)  # below 0: the step ends in contact, not beyond it
             _add_row(follower, stiffness, depth, one.along, one.about)
             if follower.is_bent and depth > 0.0 and one.is_hollow:
                 weight = stiffness * depth / query.grid.size
                 _add_bends(follower, weight, query.bends[follower.side, m])
         _factor(follower)
         _solve(follower)
+        # stable set: the step is the minimum of the piecewise quadratic model
         if not _predict_contacts(query):
             return

@@ -84,7 +84,7 @@ def follow_reading(handle, pose, velocity, buttons, hand):
     position = hand.position
     if not _is_credible(pose, velocity):
         if not math.isnan(position[0]):
-            handle.x = position[0]
+            handle.x = position[0]  # NaN marks the handle as lost, x alone is overwritten
             position[0] = math.nan
         return
     if not handle.is_placed:
@@ -97,6 +97,7 @@ def follow_reading(handle, pose, velocity, buttons, hand):
         for axis in range(6):
             hand.velocity[axis] = 0.0
         return
+    # clutch closed: a new offset at the present handle, so the handle does not jump
     if hand.is_open:
         hand.is_open = False
         _grip(handle, pose, hand)

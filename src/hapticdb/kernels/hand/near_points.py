@@ -89,6 +89,7 @@ def _outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
     gx = gx if dx == 0.0 else dx / path_length
     gy = gy if dy == 0.0 else dy / path_length
     gz = gz if dz == 0.0 else dz / path_length
+    # projection on the convex grid lengthens no distance: the clamped point's bound holds here, too
     return u + path_length, gx, gy, gz, max(bound, path_length)
 
 
@@ -100,10 +101,12 @@ def distance_at(payload, slot, mask, at):
     u, gx, gy, gz = HALF_WIDTH, 0.0, 0.0, 0.0
     if (mask >> brick_bit(i, j, k)) & np.uint64(1):
         u, gx, gy, gz = spline(payload, slot, x, y, z)
+        # far points take the tighter bound at once, since it defers them for longer
         bound = nearest_bound(payload, slot, x, y, z) if u < ONSET + MARGIN else 0.0
         if bound < ENOUGH:
             bound = lower_bound(payload, slot, x, y, z)
     else:
+        # an empty cell is a free block of 32^3 voxels, an unmarked brick one of 8^3
         bound = bound_in_free_block(x, y, z, 5 if slot == EMPTY_SLOT else 3)
     if dx != 0.0 or dy != 0.0 or dz != 0.0:
         u, gx, gy, gz, bound = _outside_grid(u, gx, gy, gz, bound, dx, dy, dz)
@@ -134,7 +137,7 @@ def _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
     vectors.
     """
     ux, uy, uz = (gz, 0.0, -gx) if abs(gy) > 0.7 * (abs(gx) + abs(gz)) else (-gz, 0.0, gx)
-    if abs(ux) + abs(uz) < 1e-9:
+    if abs(ux) + abs(uz) < 1e-9:  # gradient along y: any perpendicular will do
         ux, uy, uz = 1.0, 0.0, 0.0
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
     ux, uy, uz = ux / length, uy / length, uz / length
@@ -155,6 +158,7 @@ def _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
     b = -(px * wx + py * wy + pz * wz)
     c = -(qx * wx + qy * wy + qz * wz)
     middle, half = 0.5 * (a + c), math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+    # Jacobi rotation: it diagonalises the symmetric 2 x 2 matrix
     angle = 0.5 * math.atan2(2.0 * b, a - c)
     cosine, sine = math.cos(angle), math.sin(angle)
     return (
@@ -205,6 +209,7 @@ def _write_bends(bends, found):
 @inlined
 def _goes_nearer(u, bound, before):
     """Whether a point is too near a surface, and no farther from it than before."""
+    # a point that is already too near may move away, or the tool could never leave a surface
     return (u < FLOOR and u <= before.u) or (bound < LEAST_BOUND and bound <= before.bound)
 
 
@@ -233,18 +238,19 @@ def _query_run(query, run, transform, center):
     run_due = NEVER
     for n in range(start, end):
         point = kept[n]
+        # the distance is 1-Lipschitz: until `due` the point's bound stays above FAR
         if travelled < point.due:
             run_due = min(run_due, point.due)
             continue
         px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
         at = clamped_into(grid, px, py, pz)
         key = cell_key(np.int64(at[0]), np.int64(at[1]), np.int64(at[2]))
-        if key != last_key:
+        if key != last_key:  # neighbours share a cell: few hash look-ups
             last_key = key
             slot, mask, n_missed = enter_cell(seen, key, missed, n_missed)
         if slot < 0:
             follower.n_unknown += 1
-            point.due = run_due = -NEVER
+            point.due = run_due = -NEVER  # due at each query until the cell is resident
             continue
         if n & (merged - 1):  # represented by another point's contact
             bound = bound_at(payload, slot, mask, at)
@@ -259,9 +265,9 @@ def _query_run(query, run, transform, center):
         if u >= ONSET + MARGIN and bound >= LEAST_BOUND:
             continue
         if follower.is_advancing and _goes_nearer(u, bound, point):
-            return SHUT
+            return SHUT  # `run_due` unwritten: the run stays due
         if 0 < most_near <= n_near and merged < MOST_MERGED:
-            return MANY
+            return MANY  # near points stay due: the merged query finds them again
         lever = px - cx, py - cy, pz - cz
         near = query.near[half, n_near]
         near.point, near.u, near.bound, near.is_hollow = n, u, bound, False
@@ -297,6 +303,7 @@ def _query_due_runs(query, transform, center, path_length):
         due = kept[run].run_due
         if travelled < due:
             continue
+        # a run due twice in a row has points near: its sphere would fail again
         if follower.is_large and (due == -NEVER or due >= travelled - path_length):
             rest = rest_of_sphere(
                 seen_in(cells, which, cells.words), shell.spheres, run, transform, grid
@@ -325,6 +332,7 @@ def query_proximity(query, pose, path_length, is_advancing):
     point crosses a surface. The CPU merges likewise, as the GPU's test oracle.
     """
     shell, follower, kept = query.shell, query.follower, query.kept
+    # before any test of `due`; the way back from a refused pose adds to it, too
     follower.travelled += path_length
     follower.is_advancing, follower.way = is_advancing, path_length
     follower.n_queries += 1
@@ -334,6 +342,7 @@ def query_proximity(query, pose, path_length, is_advancing):
     transform = transform_of(pose)
     center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     while True:
+        # restart at each doubling: one factor holds for all near points of a pose
         found = _query_due_runs(query, transform, center, path_length)
         if found != MANY:
             break
@@ -343,6 +352,7 @@ def query_proximity(query, pose, path_length, is_advancing):
     travelled, least = follower.travelled, NEVER
     for run in range(n_runs_of(shell)):
         least = min(least, kept[run].run_due)
+    # inverse of due = travelled + bound - FAR: the least bound, deferred points included
     follower.tried_clearance = least - travelled + FAR
     return OPEN if follower.n_unknown == 0 else NOT_KNOWN
 
@@ -352,6 +362,7 @@ def settle(query):
     """Accept the tried pose as the tool's: its near points, their distances and onsets."""
     follower, kept = query.follower, query.kept
     before, after = query.near[follower.side], query.near[1 - follower.side]
+    # merge join of the old and the new near points
     m = n = 0
     while m < follower.n_near or n < follower.n_tried:  # both in the order of the points
         if n == follower.n_tried or (m < follower.n_near and before[m].point < after[n].point):
@@ -363,8 +374,10 @@ def settle(query):
         m += m < follower.n_near and before[m].point == near.point
         point = kept[near.point]
         point.u, point.bound = near.u, near.bound
+        # a leaving point regains the full onset while its depth is 0: no force jumps
         point.onset = max(point.onset, min(near.u, ONSET))
         n += 1
+    # double buffer: until here a refused pose has cost the tool none of its near points
     follower.side, follower.n_near = 1 - follower.side, follower.n_tried
     follower.clearance, follower.astray = follower.tried_clearance, 0.0
 
@@ -376,7 +389,7 @@ def take_more_points(query):
     if follower.merged <= 1 or ROOMY * follower.n_near > follower.merges_from:
         return False
     follower.merged //= 2
-    follower.anew = max(follower.anew, RUNS_ANEW)
+    follower.anew = max(follower.anew, RUNS_ANEW)  # a pending POINTS_ANEW stays
     if follower.gpu_query == 0:
         for n in range(kept.shape[0]):
             kept[n].run_due = -NEVER
@@ -389,7 +402,7 @@ def query_anew(query):
     follower, kept = query.follower, query.kept
     follower.travelled = follower.astray = 0.0
     follower.anew = POINTS_ANEW
-    if follower.gpu_query != 0:
+    if follower.gpu_query != 0:  # the GPU has its own `due`, reset by `anew`
         return
     for n in range(kept.shape[0]):
         kept[n].due = kept[n].run_due = -NEVER

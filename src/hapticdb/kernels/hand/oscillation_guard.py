@@ -59,6 +59,7 @@ def hand_speed(follower, hand, x, y, z):
     trail, position = follower.trail, hand.position
     oldest = max(follower.n_trail - MOST_TRAIL, 0)
     n = follower.n_trail - 1
+    # newest stored position at least WINDOW old; the margin is for rounding of the summed clock
     while n > oldest and follower.clock - trail[n % MOST_TRAIL, 0] < WINDOW * (1.0 - 1e-6):
         n -= 1
     if n < 0:
@@ -81,6 +82,7 @@ def guard_stiffness(follower, force, dt):
     """
     follower.reversals *= math.exp(-dt / FORGOTTEN)
     ahead = force - follower.extreme
+    # peak detection with hysteresis: the extreme moves along until the force returns by REVERSAL
     if (ahead >= 0.0) == follower.is_rising:
         follower.extreme = force
     elif abs(ahead) > REVERSAL:
@@ -88,7 +90,7 @@ def guard_stiffness(follower, force, dt):
         follower.reversals += 1.0
     has_acted = follower.reversals > MOST_REVERSALS and follower.wanted_share > LEAST_SHARE
     if has_acted:
-        follower.reversals = 0.0
+        follower.reversals = 0.0  # count anew under the lower stiffness
         follower.wanted_share = max(SOFTER * follower.wanted_share, LEAST_SHARE)
     follower.share = max(follower.share - SHARE_RATE * dt, follower.wanted_share)
     return has_acted
@@ -105,6 +107,7 @@ def soften_change(kept, wrench, allowed):
     if change <= allowed:
         return False
     share = allowed / change
+    # one share for all: the wrench stays on the segment between both wrenches
     for axis in range(6):
         wrench[axis] = kept[axis] + share * (wrench[axis] - kept[axis])
     return True

@@ -92,6 +92,7 @@ SUNK means an object put upon the tool."""
 def has_moved(tool, follower):
     """Whether the tool is not at the pose of its near points."""
     at, count = numbers_of(tool), 0
+    # exact comparison: any other number is a reset by the caller, and so is NaN
     for n in range(7):
         count += at[n] != follower.queried_at[n]
     return count > 0
@@ -104,6 +105,7 @@ def _meet_change(query):
     Contact with an approached surface begins at the present distance, so no force jumps. Returns
     whether a point is now inside an object.
     """
+    # before `settle`: the tried row is new, while `kept` still has the last distances
     near = query.near[1 - query.follower.side]
     is_sunk = False
     for m in range(query.follower.n_tried):
@@ -128,13 +130,14 @@ def _query_here(query, tool):
     found = query_proximity(query, tool.tried_pose, 0.0, np.bool_(False))
     if found == NOT_KNOWN:
         return False
+    # distances in two versions compare at one pose only
     is_sunk = not has_moved(tool, follower) and _meet_change(query)
     settle(query)
     set_pose(tool, follower, numbers_of(tool))
     if is_first:
         fix_onsets(query)
         is_sunk = least_distance(query) < FLOOR
-    follower.is_loose = follower.is_loose or is_sunk
+    follower.is_loose = follower.is_loose or is_sunk  # only `_follow_inside` ends it
     return True
 
 
@@ -161,12 +164,13 @@ def _follow_inside(query, spring, tool, hand):
     """
     follower, center = query.follower, query.shell.center
     measure_pull(spring, tool, hand, tool.pose, center, follower)
+    # the whole stretch at once, without advancement: inside there is no side to protect
     for axis in range(6):
         follower.step[axis] = follower.pull[axis]
     path_length = step_bound(follower, spring.radius, query.grid.size)
     at = place_on_step(tool, center, follower, 1.0)
     found = query_proximity(query, tool.tried_pose, follower.astray + path_length, np.bool_(False))
-    follower.astray = path_length
+    follower.astray = path_length  # reset by `settle`, unless the pose is refused
     if found == OPEN:
         settle(query)
         set_pose(tool, follower, at)
@@ -186,16 +190,19 @@ def follow(query, spring, tool, hand):
     follower, size, most = query.follower, query.grid.size, BEYOND_CAP * spring.cap
     stiffness = contact_stiffness(spring, size)
     found = OPEN
+    # the last turn only measures and solves: pull and contact set belong to the final pose
     for n in range(STEPS + 1):
         measure_pull(spring, tool, hand, tool.pose, query.shell.center, follower)
         brake = STOPPING * most / size if follower.is_braked else 0.0
-        turn_brake = brake * spring.radius * spring.radius
+        turn_brake = brake * spring.radius * spring.radius  # the same force at the farthest point
         solve_step(query, stiffness, brake, turn_brake, ROUNDS)
         path_length = step_bound(follower, spring.radius, size)
+        # read by the next query: curvatures are computed together with the distances
         follower.is_bent = n >= BENT_FROM or follower.n_bends > 0
         if n == STEPS or follower.n_queries >= MOST_QUERIES or path_length == 0.0:
             break
         if path_length < SETTLED and follower.n_active > 0:
+            # the pull at the end of the omitted step, to first order
             for axis in range(6):
                 follower.pull[axis] -= follower.step[axis]
             break
@@ -203,6 +210,7 @@ def follow(query, spring, tool, hand):
         if found == NOT_KNOWN:
             break
         if done == 1.0 and follower.n_active == 0 and not follower.is_braked:
+            # free motion ends at the hand bit for bit: rounding leaves no residual force
             set_pose(tool, follower, numbers_of(hand))
         follower.is_braked = done < SHORT_CUT
     return found
@@ -247,9 +255,11 @@ def _push_hand(spring, tool, hand, center, follower, is_in_contact, dt, wrench):
         )
         x, y, z = wrench[0], wrench[1], wrench[2]
         force = math.sqrt(x * x + y * y + z * z)
+    # the guard counts the spring's force: the damper's own chatter would be a reversal
     flags = IS_SOFTER if guard_stiffness(follower, force, dt) else 0
     if force > 0.0:
         speed = hand_speed(follower, hand, x / force, y / force, z / force) / spring.scale
+        # the damper neither reverses the force nor more than doubles it
         damped = force + min(max(-spring.damping * speed, -force), force)
         damped = min(damped, spring.cap)
         for axis in range(3):
@@ -259,6 +269,7 @@ def _push_hand(spring, tool, hand, center, follower, is_in_contact, dt, wrench):
     x, y, z = at[0] + rx - last[0], at[1] + ry - last[1], at[2] + rz - last[2]
     last[0], last[1], last[2] = at[0] + rx, at[1] + ry, at[2] + rz
     path_length = math.sqrt(x * x + y * y + z * z) / spring.scale
+    # a hand that moves against a still tool changes the force by spring and damper: no snap
     allowed = MOST_CHANGE * dt + (spring.stiffness + spring.damping / WINDOW) * path_length
     if soften_change(tool.kept, wrench, allowed):
         flags |= IS_SNAPPING
@@ -275,12 +286,14 @@ def finish(query, spring, servo, is_held, found, dt):
     else:
         remember_hand(follower, hand, dt)
         is_over = follower.n_queries >= MOST_QUERIES
+        # SHUT for want of queries is no obstacle
         is_in_contact = follower.n_active > 0 or (found == SHUT and not is_over)
         is_in_contact = is_in_contact and not follower.is_loose
         flags |= _push_hand(
             spring, tool, hand, query.shell.center, follower, is_in_contact, dt, wrench
         )
         for n in range(6):
+            # all six or none: `kept` is sent again in held periods
             tool.kept[n] = wrench[n] if is_finite(wrench) else 0.0
         _record_contacts(query, contact_stiffness(spring, query.grid.size), tool.felt)
         flags |= IS_DROPPED if is_over else (IS_CUT if found == SHUT else 0)
@@ -292,6 +305,7 @@ def finish(query, spring, servo, is_held, found, dt):
 def _move_tool(query, version, spring, tool, hand):
     """Move the tool after the hand, in a version of the cells -> result of the last query."""
     found = OPEN
+    # new cells or a reset pose void every `due` and near point
     if tool.version != version or has_moved(tool, query.follower):
         if not _query_here(query, tool):
             return NOT_KNOWN

@@ -39,6 +39,7 @@ else:
         """Sleep for less than a second. moment (4,) int64 is scratch memory."""
         moment[0] = 0
         moment[1] = nanoseconds
+        # request and rest share the buffer: after a signal `wait_until` spins through the rest
         _nanosleep(moment.ctypes.data, moment.ctypes.data)
 
 

@@ -25,11 +25,13 @@ SILENCE_NS = 250_000_000
 def _take_arrival(slot, hand, now):
     """Start a segment to a new pose in the slot (a seqlock), unless half-written."""
     sequence = slot.hand_sequence
-    if sequence == slot.seen or sequence & 1:
+    if sequence == slot.seen or sequence & 1:  # odd: a write is in progress
         return
+    # both fences: the copy stays between the two reads of the sequence number
     fence()
     arrived, pose, segment = slot.hand_time, slot.hand_pose, slot.segment
     for n in range(7):
+        # into scratch: a torn pose must not reach `end`
         segment.arriving[n] = pose[n]
     fence()
     if slot.hand_sequence != sequence:
@@ -37,7 +39,8 @@ def _take_arrival(slot, hand, now):
     gap = arrived - slot.arrived
     slot.arrived, slot.seen = arrived, sequence
     if 0 < gap < SILENCE_NS:
-        slot.gap += (min(gap, LONGEST_GAP_NS) - slot.gap) // 2
+        slot.gap += (min(gap, LONGEST_GAP_NS) - slot.gap) // 2  # exponential mean
+    # from the present pose, not from the old end: the motion stays continuous
     for n in range(3):
         segment.start[n] = hand.position[n]
     for n in range(4):
@@ -58,12 +61,14 @@ def follow_arrivals(slot, hand, now):
     share = 1.0 if passed >= segment.seconds else passed / segment.seconds
     rate = 0.0 if share == 1.0 else 1.0 / segment.seconds
     w, x, y, z = start[3], start[4], start[5], start[6]
+    # slerp by the rotation vector from start to end
     tx, ty, tz = turn_of(*product(end[3], end[4], end[5], end[6], w, -x, -y, -z))
     w, x, y, z = product(*quaternion_by(share * tx, share * ty, share * tz), w, x, y, z)
     length = math.sqrt(w * w + x * x + y * y + z * z)
     turned[0], turned[1], turned[2], turned[3] = w / length, x / length, y / length, z / length
     for axis in range(3):
         position[axis] = (
+            # no interpolation at the end: start + (end - start) may round
             end[axis] if share == 1.0 else (start[axis] + share * (end[axis] - start[axis]))
         )
         velocity[axis] = rate * (end[axis] - start[axis])

@@ -86,6 +86,7 @@ def move_by_coupling(slot, which, clock):
     shell, place, memory = tool_of(slot), grid_of(slot), memory_of(slot)
     cells, servo = cells_of(slot), slot.servo
     tool, sent, follower, spring = servo.tool, servo.sent, slot.follower, spring_of(slot)
+    # the version of this frame's lease; `control` may have a newer one by now
     version = cells.readers[slot.reader].version
     query = ProximityQuery(
         cells, which, shell, place, follower, memory.kept, memory.near, memory.bends, memory.met,
@@ -134,6 +135,7 @@ def feeler_of(numbers: Any) -> tuple[int, int, Any]:  # noqa: ANN401 - a law's N
         return address_of_kernel(plain, ()), 0, plain
     kind = numba.typeof(numbers)
     address = address_of_kernel(feel, (from_dtype(SLOT), INT, types.CPointer(kind)))
+    # the kernel has a bare address: the returned owner must outlive the loop
     kept = np.array(_packed(numbers), _layout_of(kind))
     return address, kept.ctypes.data, (kept, numbers)
 
@@ -209,6 +211,7 @@ def _run_period(slot, ring, clock):
     cells = voxels_of(slot)
     heartbeat = cells.control[()].heartbeat
     slot.begun, reading = begun, slot.reading
+    # double buffer: parameters set during the period count from the next one
     slot.used_spring = slot.spring
     if slot.source == HOSTED:
         follow_arrivals(slot, hand, begun)
@@ -217,8 +220,10 @@ def _run_period(slot, ring, clock):
             clock.is_over = 1
             return
         follow_reading(slot.handle, reading.pose, reading.velocity, reading.buttons, hand)
+    # too long without a complete answer of the database: cells may be out of date
     hand.is_stale = begun - heartbeat > slot.staleness
     call_kernel(clock.mover, slot, begin_frame(cells, slot.reader), clock)
+    # the lease covers the motion alone, so the writer may reuse directories between periods
     end_frame(cells, slot.reader)
     if slot.pushes != 0 and call(slot.pushes) != 0:
         clock.is_over = 1
@@ -239,6 +244,7 @@ def _run_period(slot, ring, clock):
     note(ring, slot, time, clock.dt, lateness, elapsed)
     count(slot)
     count_times(slot, lateness, elapsed)
+    # a reader that sees the new count sees the whole row of the ring, too
     fence()
     slot.n_frames += 1
     if slot.is_asked_to_end or cells.control[()].is_over:
@@ -251,6 +257,7 @@ def _run_period(slot, ring, clock):
 def _count_missed(slots, clock):
     """Count the deadlines passed during a period, as missed by all sessions; set the next one."""
     done = now_ns(clock.moment)
+    # whole periods: after a late one the deadlines keep their phase, and none is made up for
     clock.due += clock.period
     behind = (done - clock.due) // clock.period + 1 if done > clock.due else np.int64(0)
     for n in range(slots.shape[0]):
@@ -275,6 +282,7 @@ def run(slots, rings, clock_record):
             wait_until(clock.moment, clock.due)
         for n in range(slots.shape[0]):
             slot = slots[n]
+            # read once a period, since another thread adds sessions meanwhile
             if slot.worker == clock.worker:
                 if is_alone:
                     clock.begun = now_ns(clock.moment)

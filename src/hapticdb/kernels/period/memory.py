@@ -46,9 +46,11 @@ else:
             made = context.make_array(kind)(context, builder)
             lengths = cgutils.unpack_tuple(builder, arguments[1])
             size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
+            # C order: each stride is the next one times that axis's length
             strides = [context.get_constant(types.intp, size)]
             for length in lengths[:0:-1]:
                 strides.insert(0, builder.mul(strides[0], length))
+            # no `meminfo`: a view is not counted, so the loop has no atomic operations for it
             populate_array(
                 made, builder.inttoptr(arguments[0], made.data.type), lengths,
                 strides[: len(lengths)], strides[-1], None,
@@ -91,7 +93,7 @@ def cells_of(slot):
 
 @leaf
 def tool_of(slot):
-    """Tool of a request."""
+    """Tool of a session."""
     at, n_points = slot.arrays, slot.n_points
     return Clusters(
         array_at(at.points, (n_points, 6), np.float64),
@@ -138,13 +140,13 @@ def memory_of(slot):
 
 @leaf
 def grid_of(slot):
-    """Grid of a request."""
+    """Grid of a session."""
     place = slot.place
     return CellGrid(place[0], place[1], place[2], place[3], place[4])
 
 
 @leaf
 def spring_of(slot):
-    """Coupling of a request."""
+    """Spring of a session, as latched for the period."""
     n = slot.springs[slot.used_spring]
     return DeviceSpring(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])

@@ -29,7 +29,7 @@ def tell(request, hand, pose, center, radius, missed):
     """
     told, transform = request.prefetch, transform_of(pose)
     x, y, z = moved(transform, center[0], center[1], center[2])
-    request.sequence += 1
+    request.sequence += 1  # odd: readers skip it
     fence()
     told.is_active = True
     told.tool[0], told.tool[1], told.tool[2] = x, y, z
@@ -42,7 +42,7 @@ def tell(request, hand, pose, center, radius, missed):
     for n in range(missed.n_cells):
         request.missed.cells[n] = missed.cells[n]
     fence()
-    request.sequence += 1
+    request.sequence += 1  # even: complete
 
 
 @leaf
@@ -51,6 +51,7 @@ def name_voxels(request, shell, pose, place, bits, curve, met, n_hits):
 
     `met` (n_hits,): indices of the hits, decimated to at most MOST_OBJECT_REQUESTS.
     """
+    # ceiling: the stride spreads the requests over all hits
     step = max((n_hits + MOST_OBJECT_REQUESTS - 1) // MOST_OBJECT_REQUESTS, 1)
     count = 0
     transform = transform_of(pose)
@@ -86,6 +87,7 @@ def note(ring, slot, time, dt, lateness, elapsed):
     """Record the present frame in its row of the ring buffer (capacity,) of FRAME."""
     servo, spring = slot.servo, slot.springs[slot.used_spring]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
+    # the ring's row is overwritten after one turn, whether it was read or not
     row = ring[slot.n_frames % ring.shape[0]]
     row.time = time
     row.dt = dt
@@ -160,9 +162,10 @@ def show_contacts(slot, query, pose, spring):
     stiffness = contact_stiffness(spring, query.grid.size)
     n_contacts = 0
     for m in range(n_near):
+        # counted first: the stride spreads the published contacts over all of them
         n_contacts += depth_of(query, near[m]) > 0.0
     every = max((n_contacts + MOST_SHOWN - 1) // MOST_SHOWN, 1)
-    slot.contacts_sequence += 1
+    slot.contacts_sequence += 1  # seqlock, as in `tell`
     fence()
     n_published = n_shown = 0
     for m in range(n_near):
@@ -184,6 +187,7 @@ def show_contacts(slot, query, pose, spring):
 @leaf
 def show_objects(slot, request):
     """Copy the ids of touched objects from the request queue to the slot."""
+    # written by another process: not trusted as a bound of the array
     n_objects = min(request.n_objects, np.int64(MOST_OBJECT_REQUESTS))
     for n in range(n_objects):
         slot.objects[n] = request.objects[n]

@@ -58,6 +58,7 @@ def _entry_of(directory, key):
 @inlined
 def _set_least(rows, first, end):
     """Write the minimum distances over the rows not excluded to the slot behind them."""
+    # the slot behind the rows is a row of its own: the frame reads it without a special case
     rows.counts[end] = True
     for value in range(rows.distances.shape[1]):
         rows.distances[end, value] = 255
@@ -78,9 +79,11 @@ def _choose(brick, rows, exclude, number):
         if rows.counts[row]:
             least = np.int64(row)
             n_contacts += 1
+    # one row counts: it is its own minimum, without a copy
     if n_contacts > 1:
         least = end
         _set_least(rows, first, end)
+    # cached under the filter's number: recomputed only after the filter has changed
     brick.least, brick.filter = np.int32(least), np.int32(number)
 
 
@@ -93,6 +96,7 @@ def _missing_keys(directory, addresses, keys):
         if addresses[1, n] >= 0 and directory[addresses[1, n]].end == 0:
             number = number_of_key(table, found, count, addresses[0, n] >> 9)
             count = max(count, number + 1)
+    # ascending, as `enter_bricks` merges them with the fetched rows
     order = sorting_order(found[:count])
     for n in range(count):
         keys[n] = found[order[n]]
@@ -105,10 +109,12 @@ def _find_touched(directory, rows, addresses):
     count = np.int64(0)
     for n in range(addresses.shape[1]):
         at = addresses[1, n]
+        # points in the same brick are neighbours: most repeated bricks are skipped here
         if at < 0 or (n > 0 and at == addresses[1, n - 1]):
             continue
         for row in range(directory[at].first, directory[at].end):
             if rows.touched[row]:
+                # cleared here, touched rows alone: no reset of the whole cache at each frame
                 rows.touched[row] = False
                 count = insert_distinct(rows.found, 0, count, rows.id[row])
     return count
@@ -125,6 +131,7 @@ def _find_bricks(directory, addresses):
         row_key = addresses[0, n] >> 9
         if row_key != last_key:
             last_key, last_at = row_key, _entry_of(directory, row_key)
+            # goes on after a missing brick: one fetch is to bring all of them
             is_complete &= directory[last_at].end != 0
         addresses[1, n] = last_at
     return is_complete
@@ -240,6 +247,7 @@ def enter_bricks(directory, decoded, keys, row_keys, row_ids, bits, data, ends, 
             row += 1
         brick = directory[_entry_of(directory, key)]
         brick.key, brick.first, brick.end = key, np.int32(first), np.int32(used)
+        # no filter has this number: the first frame chooses
         brick.least, brick.filter = np.int32(-1), np.int32(-1)
         if used - first > 1:
             used += 1  # for the least

@@ -56,6 +56,7 @@ def _rows_between(left, right, bounds, rows_per_bucket, start):
         return 0.0
     at, after = first_bound(left, bounds, start), bounds.shape[0]
     if right < bounds[after - 1]:  # else no key is above it, and it may be the largest int64
+        # half-open [left, right + 1): `_rows_below_bound` counts keys below a bound
         right += 1
         after = first_bound(right, bounds, at)
     up_to = _rows_below_bound(right, after, bounds, rows_per_bucket)
@@ -80,6 +81,7 @@ def group_by_gap(keys, first, last, maxgap):
     highs = np.empty(total, dtype=np.int64)
     count = 0
     for n in range(total):
+        # gap between requested voxels, in voxel keys also for rows of bricks
         if n > 0 and first[n] - last[n - 1] <= maxgap:
             highs[count - 1] = keys[n]
             continue
@@ -101,6 +103,7 @@ def group_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
     for n in range(lows.shape[0]):
         if count > 0:
             first = highs[count - 1] + 1
+            # ascending gaps: each search starts at the last one's bound
             at = first_bound(first, bounds, at)
             expected = _rows_between(first, lows[n] - 1, bounds, rows_per_bucket, at)
             if expected * row_cost <= descent_cost:

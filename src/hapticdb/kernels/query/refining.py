@@ -81,6 +81,7 @@ def is_included(object_id, exclude):
     in `exclude`. The bound is tight if almost all objects are excluded.
     """
     total = exclude.shape[0]
+    # most ids are outside the excluded range: no search
     if total == 0 or object_id < exclude[0] or object_id > exclude[total - 1]:
         return True
     before, n_between = object_id - exclude[0], exclude[total - 1] - exclude[0] + 1 - total
@@ -93,6 +94,7 @@ def _has_voxel(occupancy, row, address):
     """Whether a row occupies the voxel of an address; always true for a voxel row."""
     if occupancy.shape[0] == 0:
         return True
+    # the lowest 9 bits of an address: byte of 2^3 voxels, then bit
     return (occupancy[64 * row + ((address & 511) >> 3)] >> (address & 7)) & 1 != 0
 
 
@@ -144,19 +146,20 @@ def _touch_near_rows(law, payload, counts, touched, first, end, at, point, size,
     if not sample <= reach(law):
         return
     n_unknown = 0
+    # touched before by another point: no new object to find
     for row in range(first, end):
         if counts[row] and not touched[row]:
             n_unknown += 1
     if n_unknown == 0:
         return
-    if end - first == 1:
+    if end - first == 1:  # the least distance is its own
         touched[first] = True
         return
     n_touched, nearest, least = np.int64(0), np.int64(-1), NOTHING_NEAR
     for row in range(first, end):
         if not counts[row]:
             continue
-        own = sample_rows(law, payload, counts, row, row + 1, *at)
+        own = sample_rows(law, payload, counts, row, row + 1, *at)  # this object's distance alone
         if own < least:
             nearest, least = np.int64(row), own
         if own <= reach(law):
@@ -189,12 +192,14 @@ def accumulate_point(
     low, high = least
     sums, weight, n_hits, n_apart = tally
     at = _in_grid(placed, n, place)
+    # the force follows the least distance of all objects, as in the resident cells
     sample = sample_rows(law, payload, counts, low, high, *at)
     is_hit = False
     for row in range(first, end):
         if counts[row] and _has_voxel(occupancy, row, address):
             is_hit = True
             touched[row] = True
+    # negated comparison: NaN, too, is out of reach
     if not is_hit and not sample <= reach(law):
         return tally
     point = _point_at(placed, n, place)
@@ -207,6 +212,7 @@ def accumulate_point(
         result[6 + n_hits] = max(depth, 0.0)
         n_hits += 1
     elif depth > 0.0:
+        # second half of the array: hits and other contacts grow without a count in advance
         indices[total + n_apart] = n
         result[6 + total + n_apart] = depth
         n_apart += 1
@@ -283,6 +289,7 @@ def pairs_of_points(
     starts, ends = _rows_of_keys(keys, row_keys)
     counts = _counting_rows(row_ids, exclude)
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
+    # counted first: one allocation, at its upper bound
     most = 0
     for c in range(chosen.shape[0]):
         slot = addresses[1, chosen[c]]
@@ -294,6 +301,7 @@ def pairs_of_points(
         first, end = starts[addresses[1, n]], ends[addresses[1, n]]
         is_hit = False
         for row in range(first, end):
+            # reset by assignment: marks of the point before do not stay
             touched[row] = counts[row] and _has_voxel(occupancy, row, addresses[0, n])
             is_hit |= touched[row]
         at = _in_grid(placed, n, place)

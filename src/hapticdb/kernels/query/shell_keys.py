@@ -73,6 +73,7 @@ def address_of(placed, n, place):
     x = np.floor((placed[n, 0] - place.x) / place.voxel)
     y = np.floor((placed[n, 1] - place.y) / place.voxel)
     z = np.floor((placed[n, 2] - place.z) / place.voxel)
+    # tested as floats: NaN and coordinates beyond int64 fail here
     if not (0.0 <= x < place.side and 0.0 <= y < place.side and 0.0 <= z < place.side):
         return np.int64(-1), np.int64(-1)
     i, j, k = np.int64(x), np.int64(y), np.int64(z)
@@ -115,6 +116,7 @@ def sort_keys(found, count, addresses, keys):
     for n in range(count):
         at = order[n]
         keys[n] = found[at]
+        # inverse permutation: the points are renumbered in one pass
         rank[at] = n
     for n in range(addresses.shape[1]):
         if addresses[1, n] >= 0:
@@ -182,6 +184,7 @@ def spans_of_keys(addresses, keys, grid):
         if at < 0:
             continue
         key = addresses[0, n]
+        # an address orders voxels by Z-order in the brick: other curves need the voxel's own key
         if shift > 0 and curve != Z_ORDER:
             i, j, k = voxel_at(key, bits, curve, shift)
             key = key_of(i, j, k, bits, curve)

@@ -113,6 +113,7 @@ def _near_of_run(
         if key != last_key:
             last_key = key
             slot, mask, n_missed = enter_cell(seen, key, missed, n_missed)
+            # in floats, exact below 2^53, as the scratch has them
             first = cell_place(0, 0, 0) + slot * CELL_VALUES
             base = float(first - place_before(i & -32, j & -32, k & -32))
         # bricks first: most of space is free, and the mask is in a register
@@ -121,6 +122,7 @@ def _near_of_run(
             continue
         column = column_of(i, j)
         hit, bit = bit_in(words[slot, column], k), bit_in(seen.words[slot, column], k)
+        # always written, counted if hit
         hits[n_hits] = start + at
         n_hits += np.int64(hit)
         scratch.px[n_near], scratch.x[n_near] = scratch.px[at], x
@@ -147,6 +149,7 @@ def _near_in_cells(words, in_range, start, count, box, scratch, hits, n_hits):
         hit, bit = bit_in(words[slot, column], k), bit_in(in_range[slot, column], k)
         hits[n_hits] = start + at
         n_hits += np.int64(hit)
+        # stream compaction without a branch
         scratch.kept[n_near] = at
         n_near += np.int64(bit)
     keep_points(scratch, count, n_near)
@@ -169,6 +172,7 @@ def _find_places(scratch, count, ahead):
         x = scratch.x[at] + ahead * scratch.nx[at]
         y = scratch.y[at] + ahead * scratch.ny[at]
         z = scratch.z[at] + ahead * scratch.nz[at]
+        # lowest of the 8 centres around the place: centres are at half voxels
         x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
         scratch.to_interpolate[at] = scratch.base[at] + place_before(x0, y0, z0)
         scratch.part_x[at] = x - 0.5 - x0
@@ -194,7 +198,7 @@ def _weigh_by_distance(law, cells, points, transform, grid, scratch, count):  # 
     """
     payload = cells.payload
     for at in range(count):
-        scratch.nx[at] = scratch.ny[at] = scratch.nz[at] = 0.0
+        scratch.nx[at] = scratch.ny[at] = scratch.nz[at] = 0.0  # for `_find_places`, at 0 ahead
     _find_places(scratch, count, 0.0)
     for at in range(count):
         fetch_corners(payload, np.uint64(np.int64(scratch.to_interpolate[at])))
@@ -240,6 +244,7 @@ def _weigh_by_leaves(law, cells, points, transform, grid, scratch, count):
         is_hit = bit_in(cells.words[slot, word & (CELL_WORDS - 1)], np.int64(z)) != 0
         sample = sample_slot(law, payload, slot, x, y, z)
         scratch.depth[at] = scratch.weight[at] = 0.0
+        # the point stays in the scratch without a force: adding zero keeps the order of the sums
         if not (is_hit or sample <= reach(law)):
             continue
         nx, ny, nz = scratch.nx[at], scratch.ny[at], scratch.nz[at]
@@ -288,6 +293,7 @@ def evaluate_frame(law, cells, which, shell, pose, grid, hits, missed, out):
         start, n_run = place_run(shell, run, transform, grid, scratch)
         n_near = np.int64(0)
         box = cells_of_run(seen, n_run, grid.side, scratch)
+        # a law with contacts outside the marked voxels needs the words of `_near_of_run`
         if box[0] > 0 and not anyway:
             n_near, n_hits = _near_in_cells(
                 words, seen.words, start, n_run, box, scratch, hits, n_hits
@@ -301,6 +307,7 @@ def evaluate_frame(law, cells, which, shell, pose, grid, hits, missed, out):
         if n_near == 0:
             continue
         _weigh(law, cells, points, transform, grid, scratch, n_near)
+        # in the order of the points: floating-point sums depend on it
         for at in range(n_near):
             depth = scratch.depth[at]
             weight += scratch.weight[at]
@@ -330,6 +337,7 @@ def evaluate_frames(cells, reader, shell, poses, grid, law, hits, missed_record,
     for n in range(poses.shape[0]):
         if not is_rigid(poses[n]):
             return n
+        # a lease for each frame, not for all: a long batch must not block the writer
         which = begin_frame(cells, reader)
         evaluate_frame(law, cells, which, shell, poses[n], grid, hits, missed_record[()], out[n])
         end_frame(cells, reader)

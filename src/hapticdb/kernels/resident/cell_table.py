@@ -52,6 +52,7 @@ def insert_cells(keys, slots, which, new_keys, new_slots):
     """Insert cells (n,) into directory `which`, or replace their slots."""
     for n in range(new_keys.shape[0]):
         at = place_in_set(keys[which], new_keys[n])
+        # plain stores: no frame reads this buffer before `publish`
         slots[which, at] = new_slots[n]
         keys[which, at] = new_keys[n]
 
@@ -59,6 +60,7 @@ def insert_cells(keys, slots, which, new_keys, new_slots):
 @entry(INTS2, INTS32_2, INT, INTS)
 def remove_cells(keys, slots, which, old_keys):
     """Remove cells (n,) from directory `which`, by backward-shift deletion."""
+    # no tombstones: a frame's probe sequences stay as short as after an insertion alone
     capacity = keys.shape[1]
     for n in range(old_keys.shape[0]):
         at = hole = place_in_set(keys[which], old_keys[n])
@@ -102,6 +104,7 @@ def _fill_brick(words, slot, i, j, k, occupancy, start):
         x = (i & 31) | (compact(byte >> 2) << 1)
         y = (j & 31) | (compact(byte >> 1) << 1)
         z = (k & 31) | (compact(byte) << 1)
+        # two bits along k fit one word, since bricks begin at even k
         for column in range(4):  # a byte is 2 x 2 x 2 voxels, k the lowest bit
             two = np.uint32((value >> (2 * column)) & 3)
             word = ((x | (column >> 1)) << 5) | y | (column & 1)
@@ -140,6 +143,7 @@ def _merge_row(payload, slot, i, j, k, last, values, row):
     to a brick of the cell, with a row of its own; without such a row it is BEYOND. last : first
     voxel of the cell's last brick on each axis: 24, or less in a grid smaller than a cell.
     """
+    # min is commutative: neighbouring rows store their common centres in any order
     i, j, k = i & 31, j & 31, k & 31
     low_i, low_j = -1 if i == 0 else 0, -1 if j == 0 else 0
     high_i, high_j = 9 if i == last else 8, 9 if j == last else 8
@@ -169,6 +173,7 @@ def fill_distances(row_keys, row_slots, values, bits, curve, before, payload, ma
         slot = row_slots[row]
         if slot < 0:
             continue
+        # ascending keys: all rows of a cell are neighbours, also across calls by `before`
         if slot != before:
             before = slot
             for n in range(CELL_VALUES):
@@ -203,14 +208,16 @@ def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
     """
     total = cell_of_slot.shape[0]
     count = 0
+    # two turns at most: the first clears every `used`, the second finds them clear
     for _ in range(2 * total):
         if count == wanted:
             break
         hand += 1
         if hand >= total:
-            hand = 1
+            hand = 1  # slot 0 is that of all empty cells
         if cell_of_slot[hand] < 0 or wanted_at[hand] >= since:
             continue
+        # second chance; frames set the byte without a lock: a lost mark costs a reload at most
         if used[hand]:
             used[hand] = 0
             continue
@@ -224,9 +231,12 @@ def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
 def publish(control_record, version, revision):
     """Publish a version's directory, complete in its buffer: new frames read it from now on."""
     control = control_record[()]
+    # revision before version: a frame that sees the version reads its own revision
     control.revisions[version % BUFFERS] = revision
     fence()
     control.version = version
+    # store, fence, load on both sides (Dekker): `begin_frame` announces, then reads `version`;
+    # here `version` is stored before the leases are read, so one of the two sees the other
     fence()
 
 
@@ -236,7 +246,7 @@ def oldest_version_read(readers):
     fence()
     oldest = np.int64(0x7FFFFFFFFFFFFFFF)
     for n in range(readers.shape[0]):
-        if readers[n].version > 0:
+        if readers[n].version > 0:  # 0: no frame in progress
             oldest = min(oldest, readers[n].version)
     return oldest
 
@@ -266,7 +276,9 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
                         + (y - start[1]) * move[1]
                         + (z - start[2]) * move[2]
                     ) / length
+                    # path parameter of the closest approach to the cell's centre
                     along = min(max(along, 0.0), 1.0)
+                # to the cell's box, not its centre: half an edge off on each axis
                 dx = max(abs(start[0] + along * move[0] - x) - 16.0, 0.0)
                 dy = max(abs(start[1] + along * move[1] - y) - 16.0, 0.0)
                 dz = max(abs(start[2] + along * move[2] - z) - 16.0, 0.0)
@@ -301,11 +313,13 @@ def cells_in_reach(points, first, least, reach, poses, grid, found, most):
             if not (-reach <= x < end and -reach <= y < end and -reach <= z < end):
                 continue
             box = cells_of_box(x, y, z, reach, grid.side)
+            # neighbouring points often have the same box: no look-up in the set
             if box == memo:
                 continue
             memo = box
             low_i, high_i, low_j, high_j, low_k, high_k = box
             n_cells = (high_i - low_i + 1) * (high_j - low_j + 1) * (high_k - low_k + 1)
+            # cells already in the set count again: an upper bound without a look-up
             if count + n_cells > most and (n > 0 or p >= least):
                 return n, count
             for ci in range(low_i, high_i + 1):

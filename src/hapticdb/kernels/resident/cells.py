@@ -206,6 +206,7 @@ def place_in_set(found, key):
     """Index of a key in found (capacity,), an open-addressing set; the free index for a new key."""
     capacity = found.shape[0]
     at = spread_key(key, capacity)
+    # terminates: a set is never full
     while found[at] >= 0 and found[at] != key:
         at = (at + 1) & (capacity - 1)
     return at
@@ -216,6 +217,7 @@ def slot_of(keys, slots, which, key):
     """Slot of a cell in directory `which`, or UNKNOWN."""
     capacity = keys.shape[1]
     at = spread_key(key, capacity)
+    # linear probing: the first free entry proves the cell unknown
     while keys[which, at] >= 0:
         if keys[which, at] == key:
             return np.int64(slots[which, at])
@@ -235,8 +237,10 @@ def begin_frame(cells, reader):
     control, lease = cells.control[()], cells.readers[reader]
     while True:
         version = control.version
+        # hazard pointer: announce, then verify; a writer that missed it has a newer version here
         lease.version = version
         fence()
+        # else the buffer may already be in reuse: announce the newer version
         if control.version == version:
             which = version % BUFFERS
             lease.revision = control.revisions[which]
@@ -246,6 +250,7 @@ def begin_frame(cells, reader):
 @leaf
 def end_frame(cells, reader):
     """End the frame that `begin_frame` announced; its directory may be reused."""
+    # all reads of the directory end before the lease does
     fence()
     cells.readers[reader].version = 0
 
@@ -253,6 +258,7 @@ def end_frame(cells, reader):
 @inlined
 def with_missed(missed, count, key):
     """Add an unknown cell to a MISSED, unless present or the list is full; return its length."""
+    # linear search: the list has at most MOST_MISSED cells
     for n in range(count):
         if missed.cells[n] == key:
             return count
@@ -271,7 +277,7 @@ def enter_cell(seen, key, missed, n_missed):
     slot = slot_of(seen.keys, seen.slots, seen.which, key)
     mask = np.uint64(0)
     if slot > EMPTY_SLOT:
-        seen.used[slot] = 1
+        seen.used[slot] = 1  # for the clock eviction
         mask = seen.masks[slot]
     elif slot < 0:
         n_missed = with_missed(missed, n_missed, key)

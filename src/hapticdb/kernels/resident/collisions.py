@@ -36,6 +36,7 @@ def _hit_in_run(seen, shell, scratch, run, transform, grid):
         i, j, k = np.int64(x), np.int64(y), np.int64(z)
         slot = slot_of(seen.keys, seen.slots, seen.which, cell_key(i, j, k))
         if slot < 0:
+            # goes on: a hit in a resident cell outweighs it
             hit = np.int64(UNDECIDED)
         elif bit_in(seen.words[slot, column_of(i, j)], k):
             return start + at
@@ -55,7 +56,7 @@ def _first_hit(seen, shell, transform, grid, begin):
             found = _hit_in_run(seen, shell, scratch, run, transform, grid)
             if found >= 0:
                 return found
-            hit = min(hit, found)
+            hit = min(hit, found)  # UNDECIDED outweighs NOTHING
             run += 1
     return hit
 

@@ -46,6 +46,7 @@ def mark_near_voxels(places, payload, masks, words, near):
             for k in range(SIDE):
                 middle = np.int16(min(payload[slot, at + k + 1], STEPS))
                 beside = np.int16(min(payload[slot, at + k], payload[slot, at + k + 2]))
+                # twice the least value; the axes j and i double it again, hence eighths
                 along_k[line, k] = middle + min(middle, beside)
         for i in range(CELL_SIDE):
             for j in range(SIDE):
@@ -63,5 +64,6 @@ def mark_near_voxels(places, payload, masks, words, near):
             bricks = masks[slot] >> np.uint64((word >> 8) << 4 | ((word >> 3) & 3) << 2)
             known = np.int64(0)
             for brick in range(4):
+                # a byte of the word is a brick's part of the column
                 known |= (np.int64(bricks >> np.uint64(brick)) & 1) * (np.int64(0xFF) << 8 * brick)
             near[slot, word] = bits & known

@@ -117,7 +117,7 @@ def _nearest_in_cell(seen, slot, ci, cj, ck, x, y, z, square, voxel):
                 dx = gap(x, i0 + i, i0 + i + 1.0)
                 for j in range(max(first_j, bj << 3), min(last_j, (bj << 3) | 7) + 1):
                     hit_bits = np.int64(words[slot, (i << 5) | j]) & kept
-                    if not hit_bits:
+                    if not hit_bits:  # 32 voxels in one test
                         continue
                     dy = gap(y, j0 + j, j0 + j + 1.0)
                     column = dx * dx + dy * dy
@@ -125,13 +125,13 @@ def _nearest_in_cell(seen, slot, ci, cj, ck, x, y, z, square, voxel):
                         continue
                     above, below = hit_bits >> middle, hit_bits & ((np.int64(1) << middle) - 1)
                     if above:
-                        k = k0 + middle + lowest_bit(above)
+                        k = k0 + middle + lowest_bit(above)  # nearest above, by bit scan
                         dz = gap(z, k, k + 1.0)
                         if column + dz * dz < square:
                             square = column + dz * dz
                             voxel = packed(i0 + i, j0 + j, k)
                     if below:
-                        k = k0 + highest_bit(below)
+                        k = k0 + highest_bit(below)  # nearest below
                         dz = gap(z, k, k + 1.0)
                         if column + dz * dz < square:
                             square = column + dz * dz
@@ -194,10 +194,10 @@ def room_around(seen, x, y, z, half, most, side):
                 if dk >= least:
                     continue
                 slot = slot_of(seen.keys, seen.slots, seen.which, key_of_cell(ci, cj, ck))
-                if slot == EMPTY_SLOT:
+                if slot == EMPTY_SLOT:  # free, without its mask
                     continue
                 if slot < 0:
-                    least = dk
+                    least = dk  # no nearer than the unknown cell
                 else:
                     seen.used[slot] = 1
                     least = _nearest_brick(
@@ -278,18 +278,22 @@ def bound_at(cubes, seen, x, y, z, wanted, near, shift, side):
     edge = 1.0 * (np.int64(1) << shift)
     i, j, k = np.int64(x) >> shift, np.int64(y) >> shift, np.int64(z) >> shift
     mx, my, mz = (i + 0.5) * edge, (j + 0.5) * edge, (k + 0.5) * edge
+    # both cube sizes share the cache: the lowest bit tells them apart
     key = packed(i, j, k) << 1 | (shift == CUBE_OF_BALL)
     cube = cubes[spread_key(key, cubes.shape[0])]
+    # half the diagonal: the search from the middle serves every point of the cube
     far = wanted + 0.5 * math.sqrt(3.0) * edge
+    # without a voxel the cached bound is only the radius of its search: it may be too short
     if cube.key != key or (cube.nearest < 0 and cube.bound < far):
         square, voxel = _bounded_by(mx, my, mz, far * far, near)
         square, voxel = nearest_voxel(seen, mx, my, mz, square, voxel, side)
-        if voxel == -2:
+        if voxel == -2:  # not cached: the cell may arrive
             return 0.0, np.int64(-1)
         cube.key = key
         cube.bound = math.sqrt(square)
         cube.nearest = voxel
     x, y, z = x - mx, y - my, z - mz
+    # 1-Lipschitz; the search may end at its radius, which is a bound as well
     return cube.bound - math.sqrt(x * x + y * y + z * z) - CAUTION, cube.nearest
 
 

@@ -98,6 +98,7 @@ def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
             j0, j1 = max(low_j, cj << 5) & 31, min(high_j, (cj << 5) | 31) & 31
             for ck in range(first_k, last_k + 1):
                 slot = slot_of(keys, slots, which, key_of_cell(ci, cj, ck))
+                # unknown counts as near: points there must be counted by the frame
                 if slot < 0:
                     return True
                 if slot == EMPTY_SLOT:
@@ -105,6 +106,7 @@ def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
                 used[slot] = 1
                 k0, k1 = max(low_k, ck << 5) & 31, min(high_k, (ck << 5) | 31) & 31
                 bricks = _MASKS_I[i0 >> 3, i1 >> 3] & _MASKS_J[j0 >> 3, j1 >> 3]
+                # bricks of the box by one AND of three slabs: most boxes end here
                 if not masks[slot] & bricks & _MASKS_K[k0 >> 3, k1 >> 3]:
                     continue
                 if n_columns > MOST_COLUMNS:
@@ -113,6 +115,7 @@ def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
                 for i in range(i0, i1 + 1):
                     for word in range((i << 5) | j0, ((i << 5) | j1) + 1):
                         hit_bits |= words[slot, word]
+                # one test for all columns: the interval of k is the same
                 if hit_bits & _COLUMNS[k0, k1]:
                     is_near = True
     return is_near
@@ -133,6 +136,7 @@ def _is_sphere_free(seen, spheres, n, transform, grid, reached):
         return True
     return not _is_something_near(
         seen,
+        # clamped before the conversion: a far pose exceeds int64
         np.int64(max(x - radius, 0.0)),
         np.int64(max(y - radius, 0.0)),
         np.int64(max(z - radius, 0.0)),
@@ -152,6 +156,7 @@ def _free_runs(seen, shell, run, transform, grid, reached):
     if spheres.shape[0] == 0:
         return np.int64(groups[run, 0]) if groups.shape[0] > 0 else np.int64(0)
     n_runs = spheres.shape[0]
+    # coarse to fine, each only at its own first run
     if run % BLOCK == 0 and n_runs >= BLOCK:
         block = (n_runs + GROUP - 1) // GROUP + run // BLOCK
         if _is_sphere_free(seen, groups, block, transform, grid, reached):
@@ -215,6 +220,7 @@ def cells_of_run(seen, count, side, scratch):
     there are more cells than points or `MOST_CELLS`. The loop over points is plain, for
     vectorization.
     """
+    # cells of the AABB, not of each point: a look-up each instead of a hash for each point
     i0 = i1 = _voxel_on_axis(scratch.x[0])
     j0 = j1 = _voxel_on_axis(scratch.y[0])
     k0 = k1 = _voxel_on_axis(scratch.z[0])
@@ -235,6 +241,7 @@ def cells_of_run(seen, count, side, scratch):
     for n in range(n_cells):
         i, j, k = ci + n // (n_j * n_k), cj + n // n_k % n_j, ck + n % n_k
         slot = slot_of(seen.keys, seen.slots, seen.which, key_of_cell(i, j, k))
+        # the look-up point by point lists only unknown cells that have a point
         if slot < 0:
             return np.int64(UNKNOWN), n_j, n_k, ci, cj, ck
         if slot > EMPTY_SLOT:
@@ -242,6 +249,7 @@ def cells_of_run(seen, count, side, scratch):
             hit_bits |= seen.masks[slot]
         scratch.slot_of[n] = slot
         first = cell_place(np.int64(0), np.int64(0), np.int64(0)) + slot * CELL_VALUES
+        # so that a point's index is base + offset of its voxel in the whole grid
         scratch.base_of[n] = float(first - place_before(i << 5, j << 5, k << 5))
     return n_cells if hit_bits else np.int64(0), n_j, n_k, ci, cj, ck
 
@@ -257,6 +265,7 @@ def words_of_run(count, box, start, scratch):
     n_cells, n_j, n_k, ci, cj, ck = box
     for at in range(count):
         scratch.number[at] = start + at
+        # k modulo 32, in floats
         scratch.bit[at] = np.floor(scratch.z[at]) - 32.0 * np.floor(scratch.z[at] / 32.0)
     if n_cells == 1:
         first = scratch.slot_of[0] * CELL_WORDS - 32.0 * (32.0 * ci + cj)
@@ -283,6 +292,7 @@ def keep_points(scratch, count, n_kept):
     """Move the points listed in `kept` to the front, unless they are all points of the run."""
     if n_kept == count:
         return
+    # ascending, so in place: the source is never before the target
     for n in range(n_kept):
         at = np.int64(scratch.kept[n])
         scratch.px[n], scratch.py[n], scratch.pz[n] = scratch.px[at], scratch.py[at], scratch.pz[at]

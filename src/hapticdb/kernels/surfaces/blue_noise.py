@@ -72,6 +72,7 @@ def _sift_down(heap, rank, weights, at, size):
         heap[at] = heap[child]
         rank[heap[at]] = at
         at = child
+    # the item moves once, at its final place: half of the writes of a swap
     heap[at] = item
     rank[item] = at
 
@@ -98,6 +99,7 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
         weights[a] = weight
         heap[a] = a
         rank[a] = a
+    # Floyd's heap construction, bottom up: linear time
     for at in range(n_points // 2 - 1, -1, -1):
         _sift_down(heap, rank, weights, at, n_points)
     size = n_points
@@ -112,10 +114,11 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
         cell = cell_of[item]
         for row in range(9):
             for b in range(ranges[cell, row, 0], ranges[cell, row, 1]):
-                if rank[b] < 0:
+                if rank[b] < 0:  # already eliminated
                     continue
                 weight = _pair_weight(points, face_of, normals, item, b, reach, nearest)
                 if weight > 0.0:
+                    # weights only fall, so a max-heap with positions needs no sift up
                     weights[b] -= weight
                     _sift_down(heap, rank, weights, np.int64(rank[b]), size)
     return rank
@@ -164,6 +167,7 @@ def spread_points(
     the same side; spacing : of a hexagonal lattice with the same density.
     """
     cells = _sort_into_cells(points, spacing)
+    # smaller cells: the pairs are quadratic in the crowd of a cell
     while cells.crowd > CROWD:  # sheets folded upon one another
         spacing *= 0.75
         cells = _sort_into_cells(points, spacing)

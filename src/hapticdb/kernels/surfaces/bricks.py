@@ -90,6 +90,7 @@ def grown(table, n_bricks, wanted):
         capacity *= 2
     larger = new_table(capacity)
     mask = 2 * capacity - 1
+    # rehash: bricks keep their indices, so the words move by a copy
     for n in range(n_bricks):
         larger.keys[n] = table.keys[n]
         for word in range(8):
@@ -114,6 +115,7 @@ def mark_while_room(table, n_bricks, runs, done, n_runs):
         axis = runs[done, RUN_AXIS]
         last = runs[done, RUN_LAST]
         first = runs[done, 2 - axis]
+        # upper bound, tested before the run: it is never left half marked
         if n_bricks + bricks_of_run(first, last) > keys.shape[0]:
             break
         runs[done, 2 - axis] = 0
@@ -122,11 +124,13 @@ def mark_while_room(table, n_bricks, runs, done, n_runs):
         column = ((i >> 3) << (2 * PACKED_BITS)) | ((j >> 3) << PACKED_BITS) | (k >> 3)
         column_word = (i & 4) | ((j & 4) >> 1) | ((k & 4) >> 2)
         i, j, k = i & 3, j & 3, k & 3
+        # Z-order bit of the first voxel in its word of 4^3: strides 1, 2, 4, then 8, 16, 32
         shift = ((i + 6 * (i >> 1)) << 2) + ((j + 6 * (j >> 1)) << 1) + k + 6 * (k >> 1)
         last_word = last >> 2
         start = first & 3
         for at in range(first >> 2, last_word + 1):
             key = column | ((at >> 1) << (PACKED_BITS * axis))
+            # direct-mapped cache of recent bricks: neighbouring runs cross the same ones
             memo = (key ^ (key >> 15) ^ (key >> 30)) & 255
             if recent[memo, 0] != key:
                 slot = _first_slot(key, mask)
@@ -196,6 +200,7 @@ def sorted_bricks(
     keys = packed[:n_bricks]
     rest = keys >> PACKED_BITS
     places = np.stack([rest >> PACKED_BITS, rest & PACKED_MASK, keys & PACKED_MASK], axis=1)
+    # packed keys serve the hash table alone: Z-order is made once a piece, not once a visit
     bricks_z = encode(places, PACKED_BITS, Z_ORDER)
     order = np.argsort(bricks_z)
     return bricks_z[order], words[order].astype("<i8", copy=False).view(np.uint8)

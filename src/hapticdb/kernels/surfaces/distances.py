@@ -126,8 +126,10 @@ def _set_side(shape, n, x, y, z, slope, reach):
             sides[n, field] = 0.0
         sides[n, LOW] = sides[n, NEAR_LOW] = -1.0
         sides[n, HIGH] = sides[n, NEAR_HIGH] = 1.0
+        # solved for, the interval -1 .. 1 becomes wider than any grid: no bound
         sides[n, INVERSE] = 1.0 / NEAR_ZERO
         return
+    # slope at least 0: dividing by it keeps low bounds low
     sign = -1.0 if (y if slope == AT_Y else z) < 0.0 else 1.0
     x, y, z = sign * x / length, sign * y / length, sign * z / length
     low, high = 0.0, 0.0
@@ -152,7 +154,7 @@ def _set_edges(triangles, t, shape):
     for axis in range(3):
         box[0, axis], box[1, axis] = FAR, -FAR
         for m in range(3):
-            value = triangles[t, min(m, triangles.shape[1] - 1), axis]
+            value = triangles[t, min(m, triangles.shape[1] - 1), axis]  # a point repeats its corner
             corners[m, axis] = min(max(value, -FAR), FAR)
             box[0, axis] = min(box[0, axis], corners[m, axis])
             box[1, axis] = max(box[1, axis], corners[m, axis])
@@ -299,6 +301,7 @@ def _edge_square(sides, edges, is_line, x, y, z, u, v, w):
     near = np.inf
     for m in range(3):
         s = sides[m + 1, AT_X] * u + sides[m + 1, AT_Y] * v + sides[m + 1, AT_Z] * w
+        # inside all edges the plane's distance alone counts: 0 leaves it to the caller's maximum
         if is_line or s < sides[m + 1, LOW] or s > sides[m + 1, HIGH]:
             found = _segment_square(
                 x - edges[m, 0], y - edges[m, 1], z - edges[m, 2],
@@ -329,6 +332,7 @@ def _enter_line(shape, kind, squares, at, x, y, base_z, first, end):
         square = across + along * along
         if kind == FACE:
             height = height_here + slope_z * w
+            # lower bounds; rounding must not bring the exact distance below them, for equal bits
             square = max(square, height * height)
         if square < squares[here]:
             if kind != POINT:

@@ -77,6 +77,7 @@ def square_to_triangle(corners, n, x, y, z):
     sides = sides_of(corners, n)
     ax, ay, az, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides
     px, py, pz = x - ax, y - ay, z - az
+    # edges first: they are exact for degenerate triangles, too
     square = min(
         _square_to_edge(px, py, pz, ux, uy, uz),
         _square_to_edge(px, py, pz, vx, vy, vz),
@@ -109,6 +110,7 @@ def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
     while top > 0 and best > enough * enough:
         top -= 1
         node = waiting[top]
+        # again: the best may have improved while the node waited
         if not squares[top] < best:
             continue
         if node < first_leaf:
@@ -117,6 +119,7 @@ def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
             there = _square_to_box(boxes, far, x, y, z)
             if there < here:
                 near, far, here, there = far, near, there, here
+            # the far child below the near one on the stack: depth-first, nearest first
             if there < best:
                 waiting[top], squares[top] = far, there
                 top += 1
@@ -126,6 +129,7 @@ def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
             continue
         start = (node - first_leaf) * LEAF_SIZE
         for n in range(start, min(start + LEAF_SIZE, n_triangles)):
+            # cheaper than the exact distance; ROUNDED covers the rounding of the box's distance
             if _square_to_own_box(tree.corners, n, x, y, z) > ROUNDED * best:
                 continue
             square = square_to_triangle(tree.corners, n, x, y, z)

@@ -107,6 +107,7 @@ def boxes_kernel(corners, boxes):
                 slack = max(slack, abs(corners[n, i, axis]))
     slack *= 1e-11
     first_leaf = boxes.shape[0] // 2
+    # backwards: children have higher numbers than their parent
     for node in range(boxes.shape[0] - 1, -1, -1):
         start = (node - first_leaf) * LEAF_SIZE
         for axis in range(3):
@@ -136,6 +137,7 @@ def _line_meets_box(ox, oy, oz, ix, iy, iz, boxes, node):
     """Slab test: whether the line through o, of inverse direction i, meets the node's AABB."""
     a = (boxes[node, 0, 0] - ox) * ix
     b = (boxes[node, 1, 0] - ox) * ix
+    # a line, not a ray: `near` may be negative, since both directions are counted
     near = min(a, b)
     far = max(a, b)
     a = (boxes[node, 0, 1] - oy) * iy
@@ -161,7 +163,7 @@ def _crossing_side(ox, oy, oz, dx, dy, dz, corners, n, slack):
     sx, sy, sz = ox - x, oy - y, oz - z
     px, py, pz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
     det = ax * px + ay * py + az * pz
-    if det == 0.0:
+    if det == 0.0:  # parallel to the line, or degenerate
         return 0
     u = (sx * px + sy * py + sz * pz) / det
     if u < 0.0 or u > 1.0:
@@ -197,6 +199,7 @@ def crossings(origin, direction, body, skip, tree, stack):
         visits += 1
         top -= 1
         node = stack[top]
+        # sorted by body: a subtree without the body is skipped by its span
         if tree.spans[node, 0] > body or tree.spans[node, 1] < body:
             continue
         if not _line_meets_box(ox, oy, oz, ix, iy, iz, tree.boxes, node):
@@ -238,12 +241,14 @@ def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out)
             face = picks[p, line]
             if face < 0:
                 continue
+            # shared evenly up to this patch: unspent labour goes to the next ones
             if spent > LABOUR * (p + 1) / picks.shape[0]:
                 break
             ahead, behind, visits = crossings(
                 centroids[face], directions[line], body_of[face], face, tree, stack
             )
             spent += visits
+            # the own face is skipped, so the parities differ by one on a closed surface
             if ahead < 0 or ahead % 2 == behind % 2:
                 continue
             along = 0.0

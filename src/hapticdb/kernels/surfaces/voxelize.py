@@ -97,7 +97,7 @@ def _exact_difference(a, b):
 def _exact_product(a, b):
     """(p, e) with p + e = a b exactly (Dekker 1971)."""
     p = a * b
-    t = 134217729.0 * a
+    t = 134217729.0 * a  # 2^27 + 1: Veltkamp's split into halves
     a_high = t - (t - a)
     a_low = a - a_high
     t = 134217729.0 * b
@@ -143,6 +143,7 @@ def normal_of(corners):
         dy = corners[m, 1] - corners[n, 1]
         dz = corners[m, 2] - corners[n, 2]
         longest = max(longest, dx * dx + dy * dy + dz * dz)
+    # cancellation turns the normal of a sliver: only there is twice the precision worth its time
     if longest * np.sqrt(longest) > THIN * np.sqrt(x * x + y * y + z * z):
         x = _exact_minor(corners, AXIS_Y, AXIS_Z)
         y = _exact_minor(corners, AXIS_Z, AXIS_X)
@@ -155,6 +156,7 @@ def normal_of(corners):
 @leaf
 def slope(along, length):
     """Inverse of an axis' component along the direction solved for, never infinite."""
+    # STEEP keeps the interval's product finite: 0 times infinity would be NaN
     return 1.0 / along if along * STEEP > length else STEEP / length
 
 
@@ -169,6 +171,7 @@ def _set_edge_axis(axes, row, corners, n, p, q):
     from_p, from_q, to_p, to_q = corners[n, p], corners[n, q], corners[m, p], corners[m, q]
     at_p = to_q - from_q
     at_q = from_p - to_p
+    # coefficient of q at least 0: dividing by it keeps low below high
     if at_q < 0.0:
         at_p = -at_p
         at_q = -at_q
@@ -178,6 +181,7 @@ def _set_edge_axis(axes, row, corners, n, p, q):
         return
     edge = at_p * from_p + at_q * from_q
     other = at_p * corners[o, p] + at_q * corners[o, q]
+    # two corners of the edge project alike: two values give the triangle's extent
     low = min(edge, other) - TOUCH * length - (max(at_p, 0.0) + at_q)
     high = max(edge, other) + TOUCH * length - min(at_p, 0.0)
     axes[row, 0], axes[row, 1], axes[row, 2], axes[row, 3] = at_p, low, high, slope(at_q, length)
@@ -192,7 +196,7 @@ def _set_normal_axis(plane, corners, normal, u, v, w):
     length = np.sqrt(at_u * at_u + at_v * at_v + at_w * at_w)
     plane[0] = at_u
     plane[1] = at_v
-    if length == 0.0:
+    if length == 0.0:  # null axis: no bound
         plane[2] = -1.0
         plane[3] = 1.0
         plane[4] = STEEP
@@ -203,6 +207,7 @@ def _set_normal_axis(plane, corners, normal, u, v, w):
         value = at_u * corners[n, u] + at_v * corners[n, v] + at_w * corners[n, w]
         low = min(low, value)
         high = max(high, value)
+    # the voxel's corner stands for its box: the box's own extent is moved into the bounds
     plane[2] = low - TOUCH * length - (max(at_u, 0.0) + max(at_v, 0.0) + at_w)
     plane[3] = high + TOUCH * length - (min(at_u, 0.0) + min(at_v, 0.0))
     plane[4] = slope(at_w, length)
@@ -228,6 +233,7 @@ def _place_in_grid(triangles, t, edge, corners, box):
         corners[0, axis] = a - move
         corners[1, axis] = b - move
         corners[2, axis] = c - move
+        # closed boxes: a corner on a border belongs to both voxels
         first = np.ceil(low - move - TOUCH) - 1.0
         last = np.floor(high - move + TOUCH)
         if first < -move or last > edge - 1.0 - move:
@@ -248,6 +254,7 @@ def _order_axes(box, normal):
     x = box[1, 0] - box[0, 0]
     y = box[1, 1] - box[0, 1]
     z = box[1, 2] - box[0, 2]
+    # area of the projection, plus half the AABB's outline: estimate of the columns along each axis
     columns_x = 0.5 * abs(normal[0]) + y + z
     columns_y = 0.5 * abs(normal[1]) + x + z
     columns_z = 0.5 * abs(normal[2]) + x + y
@@ -407,6 +414,7 @@ def voxelize_kernel(triangles, bits, resume, most):
         and n_bricks < most
         and n_visits < VISITS_A_BRICK * most
     ):
+        # runs are buffered: the hash table's arrays are passed once a batch, not once a run
         n_runs = _fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
         table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
         for n in range(n_runs):

@@ -95,6 +95,7 @@ def _is_inside(solid, place, lines, majority, stack):
             ahead, behind, _ = crossings(
                 place, lines[n], solid.bodies[k], np.int64(-1), solid.tree, stack
             )
+            # a closed body is crossed equally on both sides, modulo 2: else the line grazed an edge
             if ahead < 0 or ahead % 2 != behind % 2:
                 continue
             if ahead % 2 == 1:
@@ -104,7 +105,7 @@ def _is_inside(solid, place, lines, majority, stack):
             if max(inside, outside) == majority:
                 break
         if inside > outside:
-            count += solid.signs[k]
+            count += solid.signs[k]  # the wall of a void: -1
     return count > 0
 
 
@@ -148,6 +149,7 @@ def _halve(waiting, n):
         square = 0.0
         for axis in range(3):
             square += (waiting[n, i, axis] - waiting[n, (i + 1) % 3, axis]) ** 2
+        # longest-edge bisection: the halves do not degenerate, and HALFWAY holds
         if square > longest:
             first, longest = i, square
     second, third = (first + 1) % 3, (first + 2) % 3
@@ -197,29 +199,35 @@ def _search_triangle(solid, lines, tolerance, fine, most, waiting, middle, scrat
     nodes, squares, stack, sides = scratch
     top, queries = 1, np.int64(0)
     sides[0] = 0
+    # depth-first: the stack grows by one entry a halving, so WAITING bounds it
     while top > 0 and queries < most:
         top -= 1
         queries += 1
         enough = _enough(out, tolerance, fine)
+        # cheapest bound first: no place in the bodies is deeper than it is below their box's faces
         if _below_box(solid.box, waiting[top]) <= enough:
             continue
         radius = _middle_of(waiting[top], middle)
         x, y, z = middle[0], middle[1], middle[2]
+        # a distance this short prunes the piece already: its exact value is not needed
         wanted = max(enough - radius, 0.0)
         far, near = distance_at(solid.tree, x, y, z, wanted, math.inf, hint, nodes, squares)
         hint = near
         if far + radius <= enough or _farthest(solid.tree, near, waiting[top]) <= enough:
             continue
         side = sides[top]
+        # ray casting is dear: only if the middle may be deepest or its outside would prune
         if side == 0 and (far > out[0] or radius - far <= enough):
             side = 1 if _is_inside(solid, middle, lines, LIKELY, stack) else -1
         if side < 0 and radius - far <= enough:
             continue
+        # a wrong side would falsify the result: CERTAIN lines must agree
         if side > 0 and far > out[0] and _is_inside(solid, middle, lines, CERTAIN, stack):
             out[0], out[1], out[2], out[3] = far, x, y, z
             enough = _enough(out, tolerance, fine)
         if far + radius > enough and radius > tolerance and top + 2 <= WAITING:
             _halve(waiting, top)
+            # the surface is farther than the halves' middles: no crossing between, so the same side
             sides[top] = sides[top + 1] = side if far > HALFWAY * radius else 0
             top += 2
     return hint, queries
@@ -239,6 +247,7 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
     todo, top = np.empty(STACK, dtype=np.int64), 1
     scratch = nodes, squares, stack, np.empty(WAITING, dtype=np.int64)
     count = surface.corners.shape[0]
+    # incumbent first: branch and bound prunes by it from the root on
     for n in range(0, count, max(count // SAMPLES, 1)):
         place_corners(surface.corners, n, n + 1, pose, waiting)
         hint = _try_middle(solid, lines, waiting, middle, scratch, hint, out)
@@ -248,7 +257,7 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
         top -= 1
         queries += 1
         node = todo[top]
-        if surface.boxes[node, 0, 0] > surface.boxes[node, 1, 0]:
+        if surface.boxes[node, 0, 0] > surface.boxes[node, 1, 0]:  # empty: padding of the tree
             continue
         enough = _enough(out, tolerance, fine)
         radius = _ball_of(surface.boxes, node, pose, middle)
@@ -260,6 +269,7 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
         )
         if far + radius <= enough:
             continue
+        # outside at distance d the ball is nowhere deeper than R - d, so the side decides
         if radius - far <= enough and not _is_inside(solid, middle, lines, LIKELY, stack):
             continue
         if node < first_leaf:

@@ -85,6 +85,7 @@ def _box_bound(boxes, node, others, other, moved, slack):
     cx, cy, cz, hx, hy, hz = middle_of(others, other)
     x, y, z = placed_by(transform_of(pose), cx, cy, cz)
     ux, uy, uz, turned = velocity(moved, x, y, z)
+    # the box's rotation about its own middle, and the second-order rest of `bend`
     spread = moved.angle[0] * math.sqrt(hx * hx + hy * hy + hz * hz)
     more = spread + bend(moved) * (turned + spread)
     square = 0.0
@@ -92,6 +93,7 @@ def _box_bound(boxes, node, others, other, moved, slack):
         middle = x if axis == 0 else (y if axis == 1 else z)
         speed = ux if axis == 0 else (uy if axis == 1 else uz)
         half = abs(pose[axis, 0]) * hx + abs(pose[axis, 1]) * hy + abs(pose[axis, 2]) * hz
+        # swept box: per axis only the motion along that axis counts
         half += abs(speed) + more + slack
         gap = max(boxes[node, 0, axis] - middle - half, middle - half - boxes[node, 1, axis], 0.0)
         square += gap * gap
@@ -146,6 +148,7 @@ def _bound_along(nx, ny, nz, one, n, placed, m, speeds):
     if not length > 0.0:
         return 0.0
     nx, ny, nz = nx / length, ny / length, nz / length
+    # relative to a corner: without cancellation of large coordinates
     x, y, z = one[n, 0, 0], one[n, 0, 1], one[n, 0, 2]
     low, high, below, above = math.inf, -math.inf, math.inf, -math.inf
     for i in range(3):
@@ -182,6 +185,7 @@ def _measure_path_leaves(a, node, b, other, moved, parameter, size, radius, fine
     for n in range(first, min(first + LEAF_SIZE, a.corners.shape[0])):
         for m in range(end - begin):
             far = wanted(found.distance[0], fine) + slack
+            # bounds in the order of cost: boxes, two normals, then the exact pair
             bound = _axis_bound(a.corners, n, placed, m, speeds)
             if bound < far:
                 plane = _bound_by_plane(a.corners, n, a.corners, n, placed, m, speeds)
@@ -191,8 +195,10 @@ def _measure_path_leaves(a, node, b, other, moved, parameter, size, radius, fine
                 bound = max(bound, plane)
             if bound < far:
                 _, above = measure_pair(a.corners, n, placed, m, size, pair)
+                # a measured distance on the path bounds the result from above
                 _note(above, radius, parameter, pair, found)
                 x, y, z = pair[1] - pair[4], pair[2] - pair[5], pair[3] - pair[6]
+                # direction of the nearest places: the best axis of disjoint convex bodies
                 bound = max(bound, _bound_along(x, y, z, a.corners, n, placed, m, speeds))
             least = min(least, bound)
     return least - slack
@@ -232,6 +238,7 @@ def _part_in_time(a, b, motion, moved, entry_, slack, waiting):
     later, _ = _box_bound(a.boxes, node, b.boxes, other, moved, slack)
     move(motion, segment, low, middle, moved)
     earlier, _ = _box_bound(a.boxes, node, b.boxes, other, moved, slack)
+    # ties go to the earlier half: a first collision is sought
     if later < earlier:
         _push(waiting, node, other, segment, low, middle, earlier)
         _push(waiting, node, other, segment, middle, high, later)
@@ -245,6 +252,7 @@ def _part_boxes(a, b, moved, entry_, slack, waiting):
     """Push both children of the larger box of an entry, the nearer one last."""
     node, other, segment, low, high = entry_
     is_last, is_other_last = node >= a.boxes.shape[0] // 2, other >= b.boxes.shape[0] // 2
+    # descend the larger box: boxes of unlike size hardly separate
     if is_other_last or (
         not is_last and _largest_edge(a.boxes, node) >= _largest_edge(b.boxes, other)
     ):
@@ -263,6 +271,7 @@ def _part_boxes(a, b, moved, entry_, slack, waiting):
 @leaf
 def _size_of(a, b, motion):
     """Largest coordinate of both surfaces anywhere on the path."""
+    # a turn raises the largest coordinate by the root of 3 at most: hence twice
     size, reach = largest(a.boxes), 2.0 * largest(b.boxes)
     for axis in range(3):
         reach += 2.0 * abs(motion.center[axis])
@@ -301,7 +310,7 @@ def least_kernel(a, b, motion, radius, begin, fine, steps, waiting, found):
         node, other, segment = waiting.nodes[n, 0], waiting.nodes[n, 1], waiting.nodes[n, 2]
         low, high, bound = waiting.parts[n, 0], waiting.parts[n, 1], waiting.parts[n, 2]
         if found.distance[0] <= MEETING:
-            high = min(high, found.parameter[0])
+            high = min(high, found.parameter[0])  # only earlier is of interest
         if low > high or (low == high and found.distance[0] <= MEETING):
             continue
         if bound - radius >= wanted(found.distance[0], fine):
@@ -326,7 +335,7 @@ def least_kernel(a, b, motion, radius, begin, fine, steps, waiting, found):
             is_in_time = travel > IN_TIME * edge
         if is_in_time:
             _part_in_time(a, b, motion, moved, (node, other, segment, low, high), slack, waiting)
-            last[0] = -1.0
+            last[0] = -1.0  # `moved` is of a half now
         else:
             _part_boxes(a, b, moved, (node, other, segment, low, high), slack, waiting)
     return False

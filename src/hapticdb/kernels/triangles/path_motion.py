@@ -55,6 +55,7 @@ def move(motion, segment, low, high, moved):
     share, half = 0.0, 0.0
     if length > 0.0:
         share = (0.5 * (low + high) - motion.parameters[segment]) / length
+        # the expansion about the middle halves the angle, and quarters its second-order rest
         share, half = min(max(share, 0.0), 1.0), 0.5 * (high - low) / length
     square = 0.0
     for axis in range(3):
@@ -69,6 +70,7 @@ def move(motion, segment, low, high, moved):
     for axis in range(3):
         moved.pose[axis, 3] = moved.center[axis]
         for k in range(3):
+            # translation that leaves the turning centre in its place
             moved.pose[axis, 3] -= moved.pose[axis, k] * motion.center[k]
 
 

@@ -65,6 +65,7 @@ def box_gap(boxes, node, others, other, pose, slack):
     cx, cy, cz, hx, hy, hz = middle_of(others, other)
     for axis in range(3):
         middle = pose[axis, 0] * cx + pose[axis, 1] * cy + pose[axis, 2] * cz + pose[axis, 3]
+        # AABB of the moved box (Arvo): |R| h, without its eight corners
         half = abs(pose[axis, 0]) * hx + abs(pose[axis, 1]) * hy + abs(pose[axis, 2]) * hz + slack
         gap = max(boxes[node, 0, axis] - middle - half, middle - half - boxes[node, 1, axis], 0.0)
         square += gap * gap
@@ -94,6 +95,7 @@ def own_gap(boxes, node, others, other, pose, slack):
     cx, cy, cz, hx, hy, hz = middle_of(boxes, node)
     cx, cy, cz = cx - pose[0, 3], cy - pose[1, 3], cz - pose[2, 3]
     for axis in range(3):
+        # transposed rotation: it is the inverse only up to the error in `slack`
         middle = pose[0, axis] * cx + pose[1, axis] * cy + pose[2, axis] * cz
         half = abs(pose[0, axis]) * hx + abs(pose[1, axis]) * hy + abs(pose[2, axis]) * hz + slack
         gap = max(others[other, 0, axis] - middle - half, middle - half - others[other, 1, axis])
@@ -140,6 +142,7 @@ def plane_gap(one, n, other, m):
     x, y, z, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides_of(one, n)
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     longest = max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz)
+    # a degenerate triangle's normal is rounding: it bounds nothing
     if not length > FLAT * longest:
         return 0.0
     low, high = math.inf, -math.inf
@@ -172,6 +175,7 @@ def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
     place_corners(b.corners, begin, end, pose, placed)
     first = (node - a.boxes.shape[0] // 2) * LEAF_SIZE
     last = min(first + LEAF_SIZE, a.corners.shape[0])
+    # no direction yet: the null vector separates nothing
     x, y, z = 0.0, 0.0, 0.0
     if 0.0 < out[1] < math.inf:
         x, y, z = (out[2] - out[5]) / out[1], (out[3] - out[6]) / out[1], (out[4] - out[7]) / out[1]
@@ -185,6 +189,7 @@ def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
             continue
         for m in range(begin, end):
             far = out[0] + PLANE * size
+            # from the cheapest test to the dearest
             if (
                 low + _end_along(placed, m - begin, m - begin + 1, x, y, z, -1.0) < far
                 and triangle_gap(a.corners, n, placed, m - begin) < out[0] * out[0]
@@ -201,6 +206,7 @@ def _keep(below, above, n, m, found, pair, out):
     is_nearer = below < out[0]
     if is_nearer:
         out[0] = below
+    # the first pair must be within the distance of interest; later ones need only be nearer
     if above < out[1] and (is_nearer or pair[0] >= 0):
         out[1] = above
         pair[0], pair[1] = n, m
@@ -225,6 +231,7 @@ def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
     first, second = pair[0], pair[1]
     pair[0], pair[1] = -1, -1
     if first >= 0:
+        # the nearest pair of the pose before: a tight bound before the first box
         place_corners(b.corners, second, second + 1, pose, placed)
         below, above = measure_pair(a.corners, first, placed, 0, size, found)
         _keep(below, above, first, second, found, pair, out)
@@ -234,10 +241,12 @@ def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
     top = 1
     while top > 0 and out[1] > enough:
         top -= 1
+        # tested again: the bound may have fallen while the entry waited
         if not squares[top] < out[0] * out[0]:
             continue
         node, other = nodes[top, 0], nodes[top, 1]
         if (
+            # the other box's axes, after the cheaper test on the stack
             turned_slack < math.inf
             and own_gap(a.boxes, node, b.boxes, other, pose, turned_slack) >= out[0] * out[0]
         ):
@@ -256,6 +265,7 @@ def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
         if there < here:
             near, far, near_other, far_other = far, near, far_other, near_other
             here, there = there, here
+        # the nearer pair on top: it tightens the bound before the other is visited
         nodes[top, 0], nodes[top, 1], squares[top] = far, far_other, there
         top += 1
         nodes[top, 0], nodes[top, 1], squares[top] = near, near_other, here

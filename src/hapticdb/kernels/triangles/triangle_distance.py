@@ -53,6 +53,7 @@ def _try_inside(found, px, py, pz, other, m, is_first):
     sides = sides_of(other, m)
     ax, ay, az, ux, uy, uz, vx, vy, vz, _, _, _ = sides
     area, along, across = shares_of(sides, px - ax, py - ay, pz - az)
+    # division-free: the coordinates are scaled by `area`; NaN and degenerate triangles end here
     if not area > 0.0 or along < 0.0 or across < 0.0 or along + across > area:
         return
     s, t = along / area, across / area
@@ -78,6 +79,7 @@ def _try_edges(found, one, n, i, other, m, j):
     c = ux * rx + uy * ry + uz * rz
     f = vx * rx + vy * ry + vz * rz
     determinant = a * e - b * b
+    # parallel edges: their nearest places include a corner, tried by `_try_edge`
     if not determinant > 0.0:
         return
     s = (b * f - c * e) / determinant
@@ -98,6 +100,7 @@ def _separation(found, one, n, other, m, distance):
     ny = (found[2] - found[5]) / distance
     nz = (found[3] - found[6]) / distance
     low, high = math.inf, -math.inf
+    # relative to the places found: offsets are small, so their rounding is, too
     for i in range(3):
         x, y, z = one[n, i, 0] - found[1], one[n, i, 1] - found[2], one[n, i, 2] - found[3]
         low = min(low, nx * x + ny * y + nz * z)
@@ -175,9 +178,11 @@ def measure_pair(one, n, other, m, size, found):
     below = 0.0
     if above > 0.0:
         below = _separation(found, one, n, other, m, above)
+    # only without a separating axis: the crossing test is rare and dear
     if below < above * (1.0 - CERTAIN) and (
         _goes_through(found, one, n, other, m, True)
         or _goes_through(found, other, m, one, n, False)
     ):
         return 0.0, 0.0
+    # the separation less its rounding: the bound below is never too large
     return max(min(below, above) - ROUNDING * size, 0.0), above

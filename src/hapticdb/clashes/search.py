@@ -186,6 +186,7 @@ class PairSearch:
     def found(self, began: float) -> Clashes:
         """Search."""
         store, request = self._store, self._request
+        # one snapshot: rows, outlines and rules must be of the revision that the rows will name
         with store.snapshot():
             revision, kept, outlines = store.revision(), store.pairs(), store.outlines()
             of, against = (
@@ -199,6 +200,7 @@ class PairSearch:
             self._mark = kept.mark
             is_whole = of is None and against is None and not rules.ignores
             rest = kept.none()
+            # incremental: of a marked table only pairs with an object written since are read again
             if is_whole and (of := self._changed(kept, revision)) is not None:
                 kept, rest = kept.parted(of)
             rows = {(row.a, row.b): row for row in kept}
@@ -228,6 +230,7 @@ class PairSearch:
             self._write()
         left = [key for key in keys if key not in measured_keys]
         current = tuple(self._clashes(shown, measured_keys, left))
+        # statuses move on only when all is measured: an interrupted search must not lose a "new"
         if not left:
             self._settle(shown, measured_keys, Mark(self._setting, revision) if is_whole else None)
         return Clashes(
@@ -239,6 +242,7 @@ class PairSearch:
     def _changed(self, kept: StoredPairs, revision: int) -> set[int] | None:
         """Objects written since the table had all pairs; None if anything may be missing."""
         setting, since = kept.mark
+        # a negative difference: the database was put back to an older state
         if setting != self._setting or not 0 <= revision - since <= FEW or not kept.fit(setting):
             return None
         return {change.id for change in self._store.changes(since)}
@@ -273,11 +277,14 @@ class PairSearch:
                 same.append((one, other))
                 continue
             a, b = (self._shapes.placement(obj)[0] for obj in (one, other))
+            # equal shapes in one relative placement, as repeated screws are:
+            # one narrow phase for all
             group = alike.setdefault((a, b, pose.tobytes()), [])
             if not group:
                 placed.append(PlacedPair(one, other, pose))
             group.append((one, other))
         n_done = 0
+        # not strict: at the deadline the results end before the groups
         measured_pairs = zip(self._classified(placed), alike.values(), strict=False)
         for classified, pairs in chain([(DUPLICATE, same)], measured_pairs):
             for one, other in pairs:
@@ -303,6 +310,7 @@ class PairSearch:
             for n in (0, 1)
         )
         poses = relative_poses(world_from_a, world_from_b)
+        # + 0.0: a minus zero has other bytes, and would make a group of its own
         return np.asarray(np.round(poses / ROUNDING) * ROUNDING + 0.0)
 
     def _row(self, one: Object, other: Object, classified: PairResult, revision: int) -> PairRow:
@@ -344,13 +352,17 @@ class PairSearch:
             for one in placed:
                 if time.monotonic() > self._request.until:
                     break
+                # read here: a store belongs to the thread that opened it
                 a, b = self._shapes.shape(one.one), self._shapes.shape(one.other)
                 waiting.append(pool.submit(work, a, b, one.pose) if a and b else None)
+                # results in order of submission, from a bounded queue:
+                # shapes in flight stay in memory
                 if len(waiting) > IN_FLIGHT:
                     yield first.result() if (first := waiting.popleft()) else None
             while waiting:
                 yield first.result() if (first := waiting.popleft()) else None
         finally:
+            # an interrupt must not wait for pairs that have not begun
             pool.shutdown(cancel_futures=True)
 
     def _write(self, gone: Sequence[tuple[int, int]] = (), mark: Mark | None = None) -> None:
@@ -401,6 +413,7 @@ class PairSearch:
         for key, row in shown.items():
             if key in measured_keys:
                 continue
+            # an acceptance outlives its pair: it counts again if the parts come back
             if accepted(row, self._known) is not None:
                 self._waiting.append(row._replace(kind=Kind.FAR, status="same"))
             else:

@@ -79,6 +79,7 @@ class Contact:
         pose, found = self._pair.path.at([0.0])[0], self._separation
         self._motions: Iterator[MovedPair] = iter(())
         self._motions = found.separating(pose, self.reach, CLEARANCE, gap=gap)
+        # lazily: the other motions stay in the iterator until a collision
         first = next(self._motions, None)
         if first is not None:
             if gap > SAME + abs(self.error):
@@ -90,6 +91,7 @@ class Contact:
         if reach is None:
             depth = found.depth(pose, self._contact, most=MOST_QUERIES)[0]
             self.start_at_least = max(depth - abs(self.error), 0.0)
+        # the proved depth is a lower bound of the reach: no search below it
         if reach is None and seated:
             least = max(nearly, depth + CLEARANCE)
             reach = found.least(pose, least, found.most_reach, CLEARANCE, gap=gap)
@@ -126,6 +128,7 @@ class Contact:
             while self.parameter < stop and not self.is_over:
                 self._pair.check_time()
                 self._go_on(stop)
+            # apart is not enough: the tool may have gone through, and be on the other side
             if is_apart and not self.is_over and self._is_left(stop):
                 self.is_over = self.is_apart = True
 
@@ -141,11 +144,13 @@ class Contact:
         stride = STRIDE * self._contact
         parameters = np.minimum(self.parameter + stride * np.arange(1, self._block + 1), end)
         parameters = parameters[: int(np.searchsorted(parameters, end)) + 1]
+        # doubled: a short contact costs few queries, a long one few calls
         self._block = min(2 * self._block, MOST_BLOCK)
         enough = self._contact + abs(self.error)
         gaps = self._pair.measure(
             parameters, np.full(len(parameters), 2.0 * enough), enough
         ).at_least
+        # a sample that is apart only ends the block: `_is_left` proves the way there
         apart = np.flatnonzero(gaps > enough)
         return (float(parameters[apart[0]]), True) if len(apart) else (float(parameters[-1]), False)
 
@@ -165,10 +170,12 @@ class Contact:
         for moved in islice(self._motions, MOST_TRIED):
             if not self._separation.is_free(moved, pose, MEETING):
                 continue
+            # from the start of the path: the motion must free the whole contact, not its rest alone
             reached = self._pair.first_collision(moved, 0.0, stop)
             if reached > self.parameter:
                 self._change(moved, 0.0, reached)
                 return
+        # no single motion is left: only a change between two can go on
         self._motions = iter(())
         if self._changes == MOST_CHANGES or not self._hand_over(collision):
             self.is_over = self.is_hit = True
@@ -178,12 +185,14 @@ class Contact:
         assert self._moved is not None  # noqa: S101 - as above
         beyond = min(collision + BEYOND * self.reach, self._pair.path.length)
         there = self._pair.path.at([beyond])[0]
+        # a little before the collision both motions may be free, and joined
         for back in BACKS:
             parameter = max(collision - back * self.reach, self._since)
             pose = self._pair.path.at([parameter])[0]
             shifts = self.reach * self._separation.shifts(pose)
             for moved in self._separation.shifted(pose, shifts, CLEARANCE, self._still):
                 if (
+                    # cheapest test first: one pose, one change, then a stretch of the path
                     self._separation.is_free(moved, there, MEETING)
                     and self._separation.joins(self._moved, moved, pose)
                     and self._pair.first_collision(moved, parameter, beyond) >= beyond

@@ -89,6 +89,7 @@ class Pair:
         Returns the proved bound, too. In a collision it is the first one. After few proximity
         queries, the tolerance is nine times finer.
         """
+        # coarse first: its result bounds the finer search, and its queries tell the cost
         found, closed, queries = self._search(begin, best, COARSE)
         known = best if found is None else found.at_most
         if MEETING < known < np.inf and queries <= EASY:
@@ -100,10 +101,12 @@ class Pair:
 
     def _search(self, begin: float, best: float, fine: float) -> tuple[Least | None, float, int]:
         """The same to `fine` metres, and the number of proximity queries."""
+        # upper bound from samples: branch and bound prunes from its first entry
         least, closed, queries = self._sampled(begin, best), best, 0
         for motion in self._motions(best if least is None else least.at_most):
             known, end = best if least is None else least.at_most, self.length
             if least is not None and known <= MEETING:
+                # a collision is known: only an earlier one matters
                 end = min(end, least.parameter)
                 if motion.parameters[0] >= end:
                     break
@@ -142,8 +145,10 @@ class Pair:
         edges = np.linspace(0.0, self.path.length, PARTS + 1)
         middles = self.path.at(0.5 * (edges[:-1] + edges[1:]))
         gaps = self.tool.box_gaps(self._bounds[None], middles, 0.5 * np.diff(edges))[0]
+        # run-length: padded with False, so begins and ends alternate
         ends = np.flatnonzero(np.diff(np.concatenate([[False], gaps < best, [False]])))
         for first, last in ends.reshape(-1, 2).tolist():
+            # whole segments of the path: outward on both sides
             low = int(self.path.segments(edges[first : first + 1])[0])
             high = int(np.searchsorted(parameters, edges[last])) + 1
             yield motion._replace(
@@ -154,6 +159,7 @@ class Pair:
     def _finish(self, search: Search, end: float) -> None:
         """Search to an end; on a part of the path, as if they collided there."""
         if end < self.path.length:
+            # the search ends at its first collision, so a made-up one cuts the rest of the path off
             search.found.distance[0], search.found.parameter[0] = MEETING, end
         is_over = False
         while not is_over:
@@ -161,6 +167,7 @@ class Pair:
             is_over = search.go_on(STEPS)
         self.queries += search.queries
         if end < self.path.length and search.found.parameter[0] >= end:
+            # the made-up collision again: nothing was found before it
             search.found.parameter[0] = -1.0
 
     def check_time(self) -> None:
@@ -173,6 +180,7 @@ def box_gaps(tool: ToolSurface, path: ToolPath, objects: Sequence[Object]) -> tu
     """Ends (N + 1,) of stretches of a path; distances (O, N) of boxes, never too large."""
     edges = np.linspace(0.0, path.length, (STRETCHES if path.length else 1) + 1)
     bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
+    # parameters bound motion: half a stretch is the most that the tool leaves its middle pose
     middles = path.at(0.5 * (edges[:-1] + edges[1:]))
     return edges, tool.box_gaps(bounds, middles, 0.5 * np.diff(edges))
 

@@ -132,10 +132,12 @@ def _intervals(pair: Pair, contact: float) -> Iterator[tuple[float, float]]:
     """Path parameters of the begins and ends of meetings."""
     end = 0.0
     while True:
+        # any bound above MEETING finds a collision; a larger one searches more
         first = pair.least(end, 2.0 * MEETING)[0]
         if first is None or first.at_most > MEETING:
             return
         end = _parted(pair, first.parameter, contact)
+        # a collision at the start is found a little after it
         yield first.parameter if first.parameter > MEETING else 0.0, end
         if end >= pair.path.length:
             return
@@ -145,6 +147,7 @@ def _parted(pair: Pair, parameter: float, contact: float) -> float:
     """Path parameter of the parting by more than `contact` after a meeting, or the last one."""
     length = pair.path.length
     step = max(STEP * contact, length / MOST_STEPS)
+    # blocks of samples in one call, then bisection within one step
     for start in np.arange(parameter, length, 64 * step):
         parameters = np.minimum(start + step * np.arange(1, 65), length)
         is_free = _gaps(pair, parameters, contact) > contact
@@ -155,6 +158,7 @@ def _parted(pair: Pair, parameter: float, contact: float) -> float:
                 middle = 0.5 * (low + high)
                 is_apart = _gaps(pair, np.array([middle]), contact)[0] > contact
                 low, high = (low, middle) if is_apart else (middle, high)
+            # the upper end: there they are apart for certain
             return high
     return length
 
@@ -168,6 +172,7 @@ def _gravest(
 ) -> tuple[Kind, float, tuple[float, ...]]:
     """The gravest kind of a pair at poses, its depth, and its place."""
     classified = [classify_pair(still, moved, pose, 2.0 * contact, contact) for pose in poses]
+    # poses near the ends may be apart already: they are no kind of the meeting
     grave = [one for one in classified if one.kind.gravity <= Kind.TOUCHING.gravity] or classified
     worst = min(grave, key=lambda one: (one.kind.gravity, -one.at_least))
     kind = Kind.TOUCHING if worst.kind.is_free else worst.kind

@@ -38,6 +38,7 @@ class SampledPath:
 
     def segments(self, parameters: Floats) -> Ints:
         """Segments (n,) of path parameters (n,), 0 .. M - 2: the last sample before each."""
+        # right: equal parameters are a rest, and its last pose begins the motion
         found = np.searchsorted(self.parameters, parameters, side="right") - 1
         return np.asarray(np.clip(found, 0, max(len(self.parameters) - 2, 0)))
 
@@ -129,6 +130,7 @@ def checked_poses(poses: ArrayLike) -> Floats:
         raise UsageError(f"a path of shape {given.shape}: give poses (M, 4, 4), one at least")
     rotations = given[:, :3, :3]
     with np.errstate(invalid="ignore", over="ignore"):
+        # orthonormal and of positive determinant: a mirror has no quaternion
         products = np.swapaxes(rotations, 1, 2) @ rotations
         is_rigid = (
             np.isfinite(given).all(axis=(1, 2))
@@ -148,9 +150,12 @@ def _turns_between(quaternions: Floats) -> Floats:
     bw, b = quaternions[:-1, :1], -quaternions[:-1, 1:]
     w = aw * bw - (a * b).sum(axis=1, keepdims=True)
     v = aw * b + bw * a + np.cross(a, b)
+    # q and -q are one rotation: w >= 0 is the short way
     v = np.where(w < 0.0, -v, v)
     sine = np.linalg.norm(v, axis=1, keepdims=True)
+    # atan2, not acos of w: that loses half the digits of a small angle
     angle = 2.0 * np.arctan2(sine, np.abs(w))
+    # limit of angle / sine at 0, where the quotient is 0 / 0
     return np.asarray(v * np.where(sine < 1e-12, 2.0, angle / np.maximum(sine, 1e-300)))
 
 
@@ -162,9 +167,12 @@ def _turned(corners: Floats, turns: Floats, rotations: Floats) -> Floats:
     if not len(turning):
         return out
     squares = (corners**2).sum(axis=1)
+    # transposed rotation: world axis into the tool's frame, where the corners are
     axes = np.einsum("nij,ni->nj", rotations[turning], turns[turning] / angles[turning, None])
     for at in range(0, len(turning), AT_ONCE):
         along = corners @ axes[at : at + AT_ONCE].T
+        # distance from the axis; arc length is angle times radius. Rounding may give less than 0
         beside = np.sqrt(np.maximum(squares[:, None] - along**2, 0.0).max(axis=0))
         out[turning[at : at + AT_ONCE]] = angles[turning[at : at + AT_ONCE]] * beside
+    # never below the true motion: parameters are upper bounds
     return out * (1.0 + 1e-9)

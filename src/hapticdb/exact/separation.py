@@ -103,6 +103,7 @@ class Separation:
         """
         still = self.moved(NOTHING)
         for moved in self._candidates(pose, reach, clearance, still, gap, thorough=thorough):
+            # apart at the start: conservative advancement proves that the motion crosses nothing
             if gap > SAME:
                 if self.joins(still, moved, pose):
                     yield moved
@@ -119,6 +120,7 @@ class Separation:
             return next(found, None) is not None
 
         low, high = least, least
+        # geometric search upward, then bisection of the last interval
         while True:
             low, high = high, min(GROWTH * high, most)
             if high > low and is_free(high, thorough=False):
@@ -127,6 +129,7 @@ class Separation:
                 return None
         if high > (nearly := (1.0 + FINE) * least) and is_free(nearly, thorough=True):
             return nearly  # the thorough ones are slow: only once
+        # not monotone for certain: `high` is proved free, the result is an upper bound
         while high - low > FINE * high:
             middle = 0.5 * (low + high)
             low, high = (low, middle) if is_free(middle, thorough=False) else (middle, high)
@@ -148,11 +151,14 @@ class Separation:
         """
         deepest = 0.0, np.zeros(3)
         back = np.linalg.inv(pose)
+        # not symmetric: a corner of one may be deeper than any corner of the other
         for one, other, to in ((self._tool, self._object, pose), (self._object, self._tool, back)):
             if one.radius or one.is_cloud or other.interior is None:
                 continue
             there = np.array(to, dtype=np.float64)
+            # the solid's corners are about an origin of its own
             there[:3, 3] -= other.interior.origin
+            # branch and bound: the second direction has to beat the first
             least = max(contact, deepest[0])
             found, place = depth_in(
                 other.interior.solid, one.tree, there, least, TOLERANCE * contact, fine, most
@@ -196,8 +202,10 @@ class Separation:
         for _ in range(MOST_STEPS if travel else 0):
             here = self.moved(after.motion, before.motion, share)
             gap = self.gap(here, pose, 2.0 * travel)
+            # the gap at the end counts, too: the last step lands there
             if gap < MET or share >= 1.0:
                 return gap >= MET
+            # conservative advancement: no place moves farther than its gap; 0.999 covers rounding
             share = min(1.0, share + 0.999 * gap / travel)
         return not travel
 
@@ -216,10 +224,12 @@ class Separation:
         far, number = clearance + base.radius, 0
         while number < len(shifts):
             self._check()
+            # the kernel goes on from the last free shift: one call finds the next one
             out = np.array([number, -1, -1])
             free_shift_kernel(base.object, base.tool, pose, shifts, self._blocking, far, out)
             number = int(out[0])
             if out[1] >= 0:
+                # temporal coherence: the pair that blocked one motion mostly blocks the next
                 self._note_blocking(out[None, 1:])
             if number < len(shifts):
                 yield base._replace(motion=Motion("shift", shifts[number]))
@@ -227,6 +237,7 @@ class Separation:
 
     def shifts(self, pose: Floats) -> Floats:
         """Unit vectors (N, 3) of shifts that may separate, those along normals first."""
+        # several reaches are tried at one pose: normals do not depend on the reach
         if np.array_equal(self._at_shifts[0], pose):
             return self._at_shifts[1]
         near = nearest(self._object.tree, self._tool.tree, pose[None], np.array([np.inf]))
@@ -243,6 +254,7 @@ class Separation:
 
     def _known_depth(self, pose: Floats) -> float:
         """Penetration depth of a quick search, at least, metres."""
+        # by pose, as for the shifts: a search over reaches asks for it each time
         if not np.array_equal(self._at_depth[0], pose):
             self._at_depth = pose, self.depth(pose, SAME, most=QUICK)[0]
         return self._at_depth[1]
@@ -255,6 +267,7 @@ class Separation:
 
         What is deeper than the reach is freed by none, so the slower ones are left out.
         """
+        # no motion at all is the best one: reach 0
         if gap > 0.0 and self.is_free(still, pose, clearance):
             yield still
         shifts = reach * self.shifts(pose)
@@ -262,6 +275,7 @@ class Separation:
         yield from self.shifted(pose, shifts[NORMALS:], clearance, still)
         if gap <= SAME and self._known_depth(pose) > reach:
             return
+        # own axes: a hole or slot is open along one of them, oblique to the world's
         own = np.concatenate([self._object.axes, self._tool.axes @ pose[:3, :3].T])
         yield from self.shifted(pose, reach * np.concatenate([own, -own]), clearance, still)
         for motion in self._grown(reach):
@@ -270,6 +284,7 @@ class Separation:
         corners = self._object.tree.corners, self._tool.tree.corners
         far = clearance + self._tool.radius
         for is_tool, shape, *offset in self._offsets(reach, thorough=thorough):
+            # early out: the noted pairs alone, before corners are moved and a tree is refitted
             blocking = self._blocking
             if any_near_kernel(*corners, pose, blocking, far, shape.normals, is_tool, *offset):
                 continue
@@ -294,6 +309,7 @@ class Separation:
         thorough : then along their components across and along each of their axes, too, so that a
         peg or a plate gives way by all of the reach at its edges.
         """
+        # a ball has no normals of triangles: `_grown` offsets it
         both = [one for one in ((True, self._tool), (False, self._object)) if not one[1].radius]
         for one, sign in product(both, (reach, -reach)):
             yield *one, sign, NOTHING.shift, WHOLE
@@ -317,6 +333,7 @@ def _between(first: Motion, second: Motion, share: float) -> Motion:
     """Motion with a share of the second and the rest of the first."""
     if share >= 1.0:
         return second
+    # linear in all displacements: each place moves on a line, so `_travel` bounds it
     rest = 1.0 - share
     return Motion(
         second.by, rest * first.shift + share * second.shift,
@@ -355,6 +372,7 @@ def _contains_piece(
     """
     reach = growth if outer_by is None else float(np.abs(outer_by).max())
     first = np.empty((len(inner.starts), 3))
+    # broad phase: only pieces within the grown box are tested against the interior
     n_in = pieces_kernel(
         corners, inner.points, inner.pieces, inner.starts, pose, is_back, outer.box, reach, first
     )

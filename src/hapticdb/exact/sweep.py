@@ -98,6 +98,7 @@ def swept_along(
     where: Words, exclude: Words, pairs: Callable[[], Iterable["LinkPair"]] = tuple,
 ) -> Swept:  # fmt: skip
     """Sweep rigid bodies, and pairs of them, along one path."""
+    # once more from the start: the new connection has another snapshot
     with suppress(ConnectionLostError):
         return _Sweep(env, path, movers, request).swept(where, exclude, pairs())
     return _Sweep(env, path, movers, request).swept(where, exclude, pairs())
@@ -171,6 +172,7 @@ class Mover(NamedTuple):
         if self.parameters is None:
             return own
         n = int(np.searchsorted(self.path.parameters, own))
+        # at a pose exactly: a link at rest has many given parameters there, the first one counts
         is_there = n < len(self.parameters) and self.path.parameters[n] == own
         return float(
             self.parameters[n]
@@ -223,12 +225,14 @@ class _Sweep:
             revision = self._env.store.revision()
             objects = self._env.select(where, exclude)
             try:
+                # links first: their gaps bound the search among the objects, and read no database
                 for mover, obj, shape in pairs:
                     self._measure_object(mover, obj, shape, is_inside=True)
                 near = self._decide(objects)
                 self._follow()
             except OverTimeError:
                 near, is_stopped = len(objects), True
+        # objects are decided by distance of boxes, not in the order of the path
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
         hits = hits[:1] if self._request.until_hit else hits
         at_least = max(min(self._closed, self._best - self._error), 0.0)
@@ -250,6 +254,7 @@ class _Sweep:
         """Decide about objects, the nearest boxes first; returns their number."""
         least_gaps, is_inside = self._box_gaps(objects)
         nearest = least_gaps.min(axis=0, initial=np.inf)
+        # best first: a small gap soon bounds all others; stable, so results repeat
         order = np.argsort(nearest, kind="stable").tolist()
         n_near = int((nearest < self._request.limit).sum())
         parts = parts_of(self._env.store, [objects[i] for i in order])
@@ -282,6 +287,7 @@ class _Sweep:
         """Whether the boxes come near each other before the path's end of interest."""
         if self._end >= self._path.length:
             return True
+        # the path ends at the first hit: boxes that meet later do not matter
         edges, gaps = box_gaps(mover.tool, mover.path, [obj])
         return bool(gaps[0, edges[:-1] <= mover.own(self._end)].min() < self._wanted())
 
@@ -296,7 +302,9 @@ class _Sweep:
     def _wanted(self) -> float:
         """Greatest distance with an effect on the result."""
         if self._hits or self._enclosed:
+            # with a hit the gap is 0: only further hits have an effect
             return 2.0 * MEETING
+        # less by the tolerance: a nearer one within it would not change the answer
         return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
 
     def _measure_object(
@@ -316,6 +324,7 @@ class _Sweep:
         gap = pair.measure(np.zeros(1), np.array([2.0 * contact]))
         apart = float(gap.at_least[0])
         is_touched = gap.at_most[0] <= contact
+        # at a gap of 0 no side is decided; the separating motions do that
         is_nested = (
             (is_inside or is_touched) and apart > SAME and Separation(shape, tool).is_nested(pose)
         )
@@ -335,6 +344,7 @@ class _Sweep:
     ) -> None:
         """Begin a contact; gap : of the surfaces at the start of the path."""
         is_fine = pair.error < self._request.contact
+        # positive: free is free for the true surfaces, too; negative: a hit is a hit of them
         found = self._contact(pair, shape, gap, pair.error if is_fine else -pair.error)
         if not is_fine:
             self._undecided.append(obj)
@@ -351,6 +361,7 @@ class _Sweep:
         """Follow all contacts in the order of the path, then each object from its parting on."""
         share = FIRST_SHARE
         while share < 1.0:
+            # growing shares of the path: an early hit of one ends the others with `until_hit`
             share = min(LATER * share, 1.0)
             for n in range(len(self._contacts)):
                 self._advance(n, share * self._path.length)
@@ -370,6 +381,7 @@ class _Sweep:
         """Note the hit at the end of the n-th contact, unless it is within the chord error."""
         mover, obj, pair, shape, gap, found = self._contacts[n]
         if found.error > 0.0:
+            # again with the opposite sign: only a hit under both is one of the true surfaces
             found = self._contact(pair, shape, gap, -found.error)
             found.advance(mover.own(self._end))
             self._contacts[n] = self._contacts[n]._replace(found=found)
@@ -397,6 +409,7 @@ class _Sweep:
 
         A former contact begins near, so it has no part in the gap.
         """
+        # not counted: only a collision is of interest, so the bound below is short
         is_counted = not (begin or self._hits or self._enclosed)
         best = self._best if is_counted else 2.0 * MEETING + pair.error
         least, closed = pair.least(begin, best)
@@ -404,6 +417,7 @@ class _Sweep:
             self._closed = min(self._closed, closed - pair.error)
         if least is None:
             return
+        # meshes meet within their chord errors: the true surfaces may pass one another
         if pair.error and least.at_most <= pair.error and not self._collides(pair, shape, least):
             self._undecided.append(obj)
         elif least.at_most <= MEETING:
@@ -426,6 +440,7 @@ class _Sweep:
     ) -> PathPlace:  # fmt: skip
         given, pose = mover.given(parameter), mover.path.at([parameter])[0]
         segment = int(self._path.segments(np.array([given]))[0])
+        # measured in the other link's frame; places are told in the world's
         if mover.frame is not None:
             frame = mover.frame(given)
             pose = frame @ pose

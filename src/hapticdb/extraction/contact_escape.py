@@ -71,6 +71,7 @@ class Twist(NamedTuple):
         Between two of them the part's centre moves straight; a turn has steps of `ARC`.
         """
         speed = float(np.linalg.norm(self.turn))
+        # a unit of motion is about a metre: one number bounds shift and turn
         amount = min(farthest, widest / speed) if speed > 0.0 else farthest
         angles = np.linspace(0.0, amount * speed, 1 + max(int(np.ceil(amount * speed / ARC)), 1))
         found = np.tile(np.eye(4), (len(angles), 1, 1))
@@ -81,6 +82,7 @@ class Twist(NamedTuple):
         shares = np.linspace(0.0, amount, len(angles))[:, None]
         found[:, :3, 3] = self.center - found[:, :3, :3] @ self.center + shares * self.shift
         moved = found @ pose
+        # exact: the product rounds, and the path must continue without a gap
         moved[0] = pose
         return np.asarray(moved)
 
@@ -100,6 +102,7 @@ class ContactEscape:
         found: list[EscapePath] = []
         places = [np.eye(4)]
         waiting: list[tuple[int, int, Floats]] = [(0, 0, np.eye(4)[None])]
+        # best first by hits: fewer shared voxels are nearer to free space; the number breaks ties
         while waiting and not found:
             _, _, path = heapq.heappop(waiting)
             for twist in self._twists(path[-1]):
@@ -125,6 +128,7 @@ class ContactEscape:
         moved = passed(self._problem, room, twist.along(path[-1], farthest), until)
         if len(moved.poses) < 2:
             return [], []
+        # after the sweep: the voxels alone cannot tell contact from overlap
         counts = room.hits(moved.poses)
 
         def longer(n: int) -> Floats:
@@ -134,6 +138,7 @@ class ContactEscape:
         if first < last:
             chosen, is_wide = self._free(moved.poses[first:last])
             return [EscapePath(longer(first + i), is_wide) for i in chosen], []
+        # the middle of the least contact and the far end: the two poses most unlike their start
         least = np.flatnonzero(counts[1:] == counts[1:].min()) + 1
         ends = {int(least[len(least) // 2]), len(counts) - 1}
         return [], [(int(counts[n]), longer(n)) for n in sorted(ends)]
@@ -149,6 +154,7 @@ class ContactEscape:
     def _is_new(self, pose: Floats, places: list[Floats]) -> bool:
         """Whether a displacement differs from all others by more than `APART`, estimated."""
         others = np.array(places)
+        # Frobenius norm of the difference is sqrt(2) times the turn, for small turns
         turns = np.linalg.norm(pose[:3, :3] - others[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
         shifts = (pose[:3, :3] - others[:, :3, :3]) @ self._problem.center
         shifts += pose[:3, 3] - others[:, :3, 3]
@@ -166,6 +172,7 @@ class ContactEscape:
             (direction, still, center)
             for direction in candidate_directions(normals, own, self._seed)[:MOST_SHIFTS]
         ]
+        # else both centres give almost the same turns
         is_aside = np.linalg.norm(middle - center) > 0.1 * problem.radius
         motions += [
             (still, axis / problem.radius, about)
@@ -174,6 +181,7 @@ class ContactEscape:
         ]
         found = [Twist(*each, _opposed(*each, points, normals)) for each in motions]
         found = [twist for twist in found if twist.opposed <= MOST_OPPOSED]
+        # rounded, and a stable sort: nearly equal shares keep the order of the directions
         return sorted(found, key=lambda twist: round(twist.opposed, 2))
 
 
@@ -181,6 +189,7 @@ def _opposed(shift: Floats, turn: Floats, about: Floats, points: Floats, normals
     """Share of the contacts, 0 .. 1, opposed to a motion."""
     if not len(points):
         return 0.0
+    # velocity field of the twist at each contact; against the normal means into the surface
     speeds = shift + np.cross(turn, points - about)
     along = (speeds * normals).sum(axis=1)
     return float((along < AGAINST * np.linalg.norm(speeds, axis=1).max()).mean())
@@ -204,6 +213,7 @@ def unscrewed(problem: Problem, leaving: Exit, pitch: float, until: float) -> Re
             max((one @ direction).max() for one in [*near_corners, problem.corners]) - heights.min()
         )
         for hand in (1.0, -1.0):
+            # a bolt leaves its own thread, a nut the whole of the bolt
             for length in (np.ptp(heights), past):
                 if time.monotonic() > until:
                     return None

@@ -189,6 +189,7 @@ def _ordered(
     """Search by straight pulls of the objects in the way, then with the planner; `seconds` is 0."""
     search = _OrderSearch(env, request, time.monotonic() + request.seconds, workers)
     is_found = False
+    # all by straight pulls first, without the planner; equal numbers run once
     for motions in dict.fromkeys((0, request.motions)):
         search.motions_of_others = motions
         is_found = search.clear(request.parts, depth, frozenset())
@@ -275,11 +276,13 @@ class _OrderSearch:
     def _clear_one_of(self, failed: FailedSearch, depth: int, waiting: frozenset[int]) -> bool:
         """Remove one object in the way, shorter chains first."""
         before = len(self.steps)
+        # iterative deepening: a short chain is found before a long one is tried
         for less in range(depth):
             if self._workers is not None and less == 0:
                 self._search_ahead(self._workers, failed, waiting)
             for obj in self._candidates(failed, waiting):
                 self.clear((obj,), less, waiting)
+                # any removal may have freed the parts, so they are tried before the next object
                 if len(self.steps) > before:
                     return True
         return False
@@ -306,6 +309,7 @@ class _OrderSearch:
             yield obj
 
     def _is_over(self) -> bool:
+        # sticky: the verdict must say that time ended the search, whenever it is read
         self.is_spent |= time.monotonic() > self._until
         return self.is_spent
 
@@ -322,6 +326,7 @@ class _OrderSearch:
         ids = ids_of(parts)
         is_wanted = ids == ids_of(self._request.parts)
         motions = self._request.motions if is_wanted else self.motions_of_others
+        # memo of failures: the tree of chains meets the same object often
         known = self._known.get(ids)
         if known is not None and self._would_fail_again(known, motions):
             return known.failed
@@ -340,7 +345,9 @@ class _OrderSearch:
                 self.steps.append(Removal(found, tuple(sorted({*ids, *excluded}))))
                 return None
             failed = FailedSearch(parts, n_gone, found.verdict, found.blockers)
+            # near ones count, too: a motion may depend on them without a hit
             obstacles |= {*ids_of([one.object for one in failed.blockers]), *ids_of(found.near)}
+        # `n_gone` from before the search: only later steps can void the failure
         self._known[ids] = _Known(n_gone, motions, obstacles, failed)
         self.failed.append(failed)
         return failed
@@ -353,6 +360,7 @@ class _OrderSearch:
         """
         if known.failed.verdict is None:
             return True
+        # a larger budget of the planner may find what the smaller one missed
         if motions > known.motions:
             return False
         if motions:
@@ -372,6 +380,7 @@ class _OrderSearch:
         def search(motions: int) -> Extraction:
             if self._workers is None:
                 return extract(self._env, *ids, **self._options(motions))
+            # the key has all that a result depends on: a task of another state is never taken
             task = self._ahead.pop((ids, self._excluded(), motions), None)
             found: Extraction = self._workers.result(
                 task or self._given(self._workers, ids, motions)
@@ -402,6 +411,7 @@ class _OrderSearch:
 
     def drop_unneeded(self) -> None:
         """Drop steps without which all later ones are proved as well, from last to first."""
+        # from the end: a late step is needed by few others, and dropping it voids no earlier proof
         for n in range(len(self.steps) - 2, -1, -1):
             if time.monotonic() > self._until:
                 return
@@ -418,6 +428,7 @@ class _OrderSearch:
         for step in reversed(self.steps[n + 1 :]):
             found, path = step.found, step.found.path
             assert path is not None  # noqa: S101 - steps are proved
+            # the same path among more objects: only a new sweep proves it
             excluded = tuple(i for i in step.excluded if i not in self.steps[n].ids)
             left = max(self._until - time.monotonic(), LEAST)
             again = sweep(

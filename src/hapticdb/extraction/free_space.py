@@ -58,6 +58,7 @@ class Room:
 
     def _between(self, ends: Floats) -> Floats:
         """Poses (n, 4, 4) between two poses (2, 4, 4), as in `parameters`; a shift is faster."""
+        # equal bits, not nearly: a plan of shifts has one rotation, copied to every state
         if not np.array_equal(ends[0, :3, :3], ends[1, :3, :3]):
             path = self._problem.path(ends)
             return path.at(self.parameters(path))
@@ -126,8 +127,10 @@ class FreeSpace(Closes):
 
 def _from_coarse_to_fine(n: int) -> list[Ints]:
     """Indices 0 .. n - 1 in blocks, each once: the last one, then from coarse to fine strides."""
+    # the end first: a state in collision refutes every motion to it
     order: list[int] = [n - 1]
     seen = {n - 1}
+    # coarse to fine: a wide obstacle is met after few poses
     stride = 1 << max(n - 1, 1).bit_length()
     while stride >= 1:
         fresh = [i for i in range(0, n, stride) if i not in seen]

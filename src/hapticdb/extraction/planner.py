@@ -96,6 +96,7 @@ class Planner:
 
     def reject_start(self) -> None:
         """Drop the start of the last path, because its first part is refuted."""
+        # by identity: two starts may have equal poses and other motions before
         self._starts = [one for one in self._starts or [] if one is not self._used]
 
     def search(self) -> Floats | None:
@@ -108,6 +109,7 @@ class Planner:
         if self._starts is None:
             self._starts = self._found_starts()
         wide = [one for one in self._starts if one.is_wide]
+        # straight legs first: they cost no query of the planner
         if self._leaving is not None and self._starts:
             path = self._by_legs(self._leaving, wide)
             if path is not None:
@@ -139,12 +141,14 @@ class Planner:
     def _in_room(self, room: Room, starts: list[EscapePath], part: _Share) -> Floats | None:
         """Path from one of the starts, in one space: by shifts alone, then with turns."""
         now, before = time.monotonic(), self.n_motions
+        # shifts alone first: R^3 instead of SE(3) needs far fewer queries
         soon = _Share(
             max(int(SHARE_OF_SHIFTS * part.motions), 1), now + SHARE_OF_SHIFTS * (part.until - now)
         )
         path = self._plan(room, starts[:MOST_STARTS], 0.0, soon)
         if path is not None:
             return path
+        # what the shifts left over goes to the search with turns
         left = part._replace(motions=max(part.motions - (self.n_motions - before), 1))
         return self._plan(room, starts[:MOST_STARTS], self._problem.radius, left)
 
@@ -160,16 +164,20 @@ class Planner:
             return [EscapePath(here, is_wide=True)]
         found: list[tuple[float, EscapePath]] = []
         for pull in self._pulls.done:
+            # a little before the hit: there the part is in contact again
             farthest = pull.free - BACK * self._problem.voxel_size
             is_told = pull.is_swept or pull.contact_length <= LEAVING * self._problem.voxel_size
+            # a pull without a sweep may have passed a thin wall between two samples
             if farthest <= 0.0 or not is_told:
                 continue
             path = self._problem.path(pull.poses(np.array([0.0, farthest])))
             parameters = self._space.room.parameters(path)
             poses = path.at(parameters)
+            # the wide space has a margin: states there are refuted less by the sweep
             for room in (self._space.wide, self._space.room):
                 first, last = first_run(room.are_free(poses))
                 if first < last:
+                    # the end of the first free run: beyond it the pull is in contact again
                     escape = np.stack([np.eye(4), poses[last - 1]])
                     is_wide = room is self._space.wide
                     found.append((float(parameters[last - 1]), EscapePath(escape, is_wide)))
@@ -190,6 +198,7 @@ class Planner:
         turning : weight of a turn, metres a radian; 0 for shifts alone, from those starts with the
         rotation of the first one.
         """
+        # one rotation for a plan of shifts: the state space has no other
         turn = starts[0].poses[-1][:3, :3] if turning == 0.0 else None
         if turn is not None:
             starts = [one for one in starts if np.allclose(one.poses[-1][:3, :3], turn, atol=SAME)]
@@ -201,6 +210,7 @@ class Planner:
         if not len(goals):
             return None
         first, last = self._rows(np.stack([one.poses[-1] for one in starts])), self._rows(goals)
+        # OMPL samples in a box: it must hold all starts and goals
         ends = np.concatenate([first[:, :3], last[:, :3], self._goals.corners])
         margin = self._problem.voxel_size
         request = PlanRequest(
@@ -220,6 +230,7 @@ class Planner:
                 if message is None:
                     if time.monotonic() >= until:
                         return None  # leaving ends the process
+                    # the pipe closes before the process is gone: silence alone is no end
                     if process.wait(ENDING):
                         raise HapticDBError("the planner's process has ended: search again")
                     continue
@@ -250,14 +261,17 @@ class Planner:
         self, rows: Floats, turn: Floats | None, starts: list[EscapePath], first: Floats
     ) -> Floats:
         """Whole path of displacements (M, 4, 4): to the planner's start, along its states, on."""
+        # the planner does not say which start it used: the nearest one
         off = np.abs(first[:, :3] - rows[0, :3]).max(axis=1)
         if turn is None:
+            # q and -q are one rotation: compare on the same half of the sphere
             signs = np.sign((first[:, 3:] * rows[0, 3:]).sum(axis=1))[:, None]
             off += np.abs(signs * first[:, 3:] - rows[0, 3:]).max(axis=1)
         self._used = starts[int(np.argmin(off))]
         poses = self._poses(rows, turn)
         path = np.concatenate([self._used.poses, poses[1:]])
         path = np.concatenate([path, self._goals.beyond(path[-1])])
+        # rounding adds up in products: rotations are made orthonormal for the sweep
         path[:, :3, :3] = rotation_of(quaternion_of(path[:, :3, :3]))
         return path
 

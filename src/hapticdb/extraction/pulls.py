@@ -88,6 +88,7 @@ class Pulls:
         for n in range(total):
             if n in self._swept:
                 continue
+            # at least one, so that a result names what is in the way
             if self.done and time.monotonic() > until:
                 return
             self.done.append(self._pull(n))
@@ -141,6 +142,7 @@ class Pulls:
 
     def _followed(self, direction: Floats, distances: Floats) -> tuple[int, int]:
         """Numbers of the poses in contact from the start and before a hit, after (n,) metres."""
+        # sliding lasts while the hits stay within GROWTH times those at the start
         contact, most, room = 0, -1.0, self._space.room
         for first, end in _blocks(len(distances)):
             poses = poses_along(direction, distances[first:end])

@@ -161,6 +161,7 @@ def _searched(problem: Problem, request: _Request, progress: Progress | None) ->
         problem.radius + problem.voxel_size,
         request.out,
     )
+    # time kept back: a path without a sweep proves nothing
     until = problem.until - SHARE_OF_PROOF * request.seconds
     n_motions, is_planned = 0, False
     path = None if request.to is None else prove(problem, np.stack([np.eye(4), request.to]), "pull")
@@ -218,6 +219,7 @@ def _best_pull(problem: Problem, pulls: Pulls) -> RemovalPath | None:
     Sweeps then replace the free lengths and blockers of the judged pulls.
     """
     outs = [n for n, pull in enumerate(pulls.done) if pull.is_out]
+    # short contacts first: long ones are the likeliest to be refuted by the sweep
     outs.sort(key=lambda n: (pulls.done[n].contact_length, pulls.done[n].length))
     undecided: RemovalPath | None = None
     for n in outs[:MOST_OUT]:

@@ -99,7 +99,9 @@ def checked_values(machine: Machine, q: ArrayLike) -> Floats:
     bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
     if len(bad):
         raise UsageError(f"row {bad[0]} of the joint path has a value that is not finite")
+    # one row is a path of no length: the sweep needs a segment
     values = machine.values(given if len(given) > 1 else given[[0, 0]])
+    # negated, so NaN is refused, too
     for row, n in np.argwhere(~(np.abs(values) <= MOST_VALUE)):
         raise UsageError(
             f"joint {machine.joints[n].name} is at {values[row, n]:.6g} in row {row} of the joint "
@@ -126,6 +128,7 @@ def joint_path(machine: Machine, values: Floats, pairs: Iterable[tuple[int, int]
     placed = machine.all_placed(values)
     with np.errstate(over="ignore", invalid="ignore"):
         speeds = [motion_bounds(machine, values, *pair, placed).speed for pair in pairs]
+    # the fastest pair of links: a bound for all, so one parameter orders every hit
     parameters = np.concatenate([[0.0], np.cumsum(np.max(speeds, axis=0))])
     if not np.isfinite(parameters[-1]):
         raise UsageError("the joint path is longer than numbers go: check its units")
@@ -140,8 +143,10 @@ def mover_of(
     values, surface = path.poses, machine.surfaces[last]
     with np.errstate(over="ignore", invalid="ignore"):
         _, bend, turn = motion_bounds(machine, values, first, last)
+    # chord error h^2 / 8 times the second derivative, solved for the number of parts
     counts = np.maximum(np.sqrt(bend / (8.0 * DEVIATION)), turn / MOST_TURN)
     counts = np.maximum(np.ceil(counts), 1.0)
+    # negated as above: the sum overflows with the bounds
     if not counts.sum() <= MOST_POSES:
         raise UsageError(
             f"link {machine.names[last]} moves too far for one sweep: divide the joint path"
@@ -152,8 +157,10 @@ def mover_of(
         + [[len(rows)]]
     )
     own = np.stack([np.interp(knots, np.arange(len(values)), one) for one in values.T], axis=1)
+    # relative motion: the other link stands still, so it can play the part of an object
     before = base if frame is None else np.linalg.inv(machine.placed(own, first))
     poses = before @ machine.placed(own, last)
+    # the inverse leaves rounding in the last row, and `checked_poses` compares exactly
     poses[:, 3] = 0.0, 0.0, 0.0, 1.0
     motion = ToolPath.of(poses, surface.corners, surface.corners.mean(axis=0))
     parameters = np.interp(knots, np.arange(len(values)), path.parameters)

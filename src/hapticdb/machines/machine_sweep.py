@@ -78,8 +78,8 @@ def sweep_machine(
     values = checked_values(machine, q)
     pairs, notes = _tested(machine, contact)
     shown = machine.all_placed(values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)])
-    pairs.sort(key=lambda pair: _gap(machine, pair, shown, np.inf))
-    scene = [(0, link) for link in machine.surfaces]
+    pairs.sort(key=lambda pair: _gap(machine, pair, shown, np.inf))  # bounds the later ones
+    scene = [(0, link) for link in machine.surfaces]  # link 0 is the base: it stands still
     path = joint_path(machine, values, [*pairs, *scene])
     movers = [mover_of(machine, path, *link, None, base) for link in scene]
     found = swept_along(
@@ -102,6 +102,7 @@ def _tested(machine: Machine, contact: float) -> tuple[list[tuple[int, int]], li
     tested: list[tuple[int, int]] = []
     touching: list[tuple[int, int]] = []
     for a, b in pairs:
+        # no list in the file: neighbours in contact at zero are taken for joined, not for clashing
         is_touching = _gap(machine, (a, b), zero, 2.0 * contact) <= contact
         (touching if is_touching else tested).append((a, b))
     remarks = ", ".join(f"{machine.names[a]} and {machine.names[b]}" for a, b in touching)
@@ -126,7 +127,7 @@ def _link_pairs(
 ) -> Iterator[LinkPair]:
     for a, b in pairs:
 
-        def frame(parameter: float, link: int = a) -> Floats:
+        def frame(parameter: float, link: int = a) -> Floats:  # the default binds `a` now
             return np.asarray(base @ machine.placed(path.at([parameter]), link)[0])
 
         shape = machine.surfaces[a]

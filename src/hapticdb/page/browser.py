@@ -205,11 +205,13 @@ class Browser:
         if not self.visitor.may("toucher") or self._is_closed:
             return
         with self._swapping:
+            # requests merge: a new start of one waiting request must survive the other
             self._keeps_tool = keeps_tool and self._keeps_tool is not False
         self.site.workers.submit(self._begin_wanted)
 
     def _begin_wanted(self) -> None:
         """Start sessions while one is requested, unless another worker is doing so."""
+        # non-blocking: a request that comes while another worker begins is taken in its next turn
         while self._keeps_tool is not None and self._beginning.acquire(blocking=False):
             try:
                 self._begin()
@@ -224,12 +226,15 @@ class Browser:
     def _begin(self) -> None:
         """End the session, and start the requested one."""
         with self._swapping:
+            # taken before the work: a request during it starts another session
             keeps_tool, self._keeps_tool = self._keeps_tool, None
         if keeps_tool is None or self._is_closed:
             return
+        # the old session ends first: its slot and cells may be needed
         tool = self._leave_session()
         self._end_sessions()
         start = tool if keeps_tool and tool is not None else self.hand
+        # before `begin`: a change meanwhile differs from it and asks again
         self._excluded_ids = self.excluded_ids
         with ExitStack() as undo:
             undo.callback(self.drawing.rest)
@@ -238,12 +243,14 @@ class Browser:
                 self.tool.shell, pose_of_row(start[:3], start[3:]), exclude=self._excluded_ids,
                 coupling=self._coupling(), scale=self.scale,
             )  # fmt: skip
+            # the browser may close during `begin`: then nothing else ends the session
             undo.callback(session.end)
             session.move(self.hand)
             self._share()
             with self._swapping:
                 if self._is_closed:
                     return
+                # published last, under the lock: `close` either sees it or comes first
                 self.session = session
                 undo.pop_all()
 
@@ -262,6 +269,7 @@ class Browser:
     def _give_up(self, session: HostedSession) -> bool:
         """Detach the session for `_end_sessions`; False if it is detached already."""
         with self._swapping:
+            # tick and worker may both find it over: one of them detaches it
             if self.session is not session:
                 return False
             self.session = None
@@ -271,6 +279,7 @@ class Browser:
     def _end_sessions(self) -> None:
         """End the detached sessions, and report the lost frames of their recordings."""
         with self._swapping:
+            # taken under the lock, ended outside: `end` waits for the host
             over, self._over = self._over, []
         for session in over:
             try:
@@ -326,6 +335,7 @@ class Browser:
         self._shared = [unseen, label, node]
 
     def _unshare(self) -> None:
+        # swapped first: the clock's thread must not move removed nodes
         shared, self._shared = self._shared, []
         for node in shared:
             node.remove()
@@ -334,6 +344,7 @@ class Browser:
         """Show the newest frame of the session; called `site.TICKS` times a second."""
         session = self.session
         if session is not None and session.is_over:
+            # a lost session is noticed by one tick alone, and begun again once
             if self._give_up(session):
                 self.drawing.rest()
                 self.session_ended()
@@ -383,6 +394,7 @@ class Browser:
 
     def close(self) -> None:
         """End the session and remove the tool from every view."""
+        # first: callbacks and workers that begin now turn back
         self._is_closed = True
         self.site.view.contents.leave(self.client.client_id)
         if self.site.edits is not None:

@@ -109,7 +109,9 @@ class PageConnection:
         """Visitor of a client; KeyError without a connection or without the secret."""
         request = self._live[client_id].request
         assert request is not None  # noqa: S101 - the handshake is over
+        # all headers joined: a second one from the browser must not hide behind the server's
         shown = "".join(request.headers.get_all(SECRET)).encode(errors="replace")
+        # constant time: any user of the machine can try on the loopback interface
         if not hmac.compare_digest(shown, self._secret):
             raise KeyError(client_id)
         ids = tuple(int(i) for i in request.headers.get(SHOWN, "").split(",") if i)

@@ -89,6 +89,7 @@ class PersonsEdits:
         """Restore the object removed last; UsageError without one, or ConflictError."""
         if not self._out:
             raise UsageError("you have taken no part out")
+        # dicts keep the order of insertion: the last one taken out
         before = [*self._out.values()][-1]
         self._put_back(before)
         self._note(_Step("put back", before, before.transform))
@@ -98,6 +99,7 @@ class PersonsEdits:
         """Undo the person's last edit; ConflictError after another person's write of its object."""
         if not self._done:
             raise UsageError("there is nothing to undo")
+        # popped after success: an edit that fails for another reason can be undone again
         step = self._done[-1]
         before = step.before
         try:
@@ -150,8 +152,11 @@ class PersonsEdits:
 
         `obj` was read after the write, so it may include a later write by another person.
         """
+        # optimistic locking: another base means that another person wrote between
         if base != self._revisions.get(obj.id, base):
             self._drop(obj.id)
+        # another place: another person wrote after this commit;
+        # with the base an undo ends as a conflict
         self._revisions[obj.id] = obj.revision if np.array_equal(obj.transform, place) else base
 
     def _drop(self, object_id: int) -> None:
@@ -195,6 +200,7 @@ class Edits:
             failed(error)
 
         def work(env: Environment) -> Answer:
+            # made in the database's thread: a store belongs to the thread that opened it
             own = self._of.get(person)
             if own is None:
                 own = self._of[person] = PersonsEdits(env)

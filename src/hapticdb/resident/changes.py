@@ -26,10 +26,12 @@ def writes_since(store: Store, known_revision: int, revision: int) -> list[Chang
     commits (the revision is ahead), if there are more than `MOST_CHANGES`, or if the store
     has lost some of them.
     """
+    # every write adds one revision, so the difference is their number
     n_missed = revision - known_revision
     if known_revision < 0 or not 0 <= n_missed <= MOST_CHANGES:
         return None
     changes = list(store.changes(known_revision)) if n_missed else []
+    # a gap in the log: an unseen write may have touched any cell
     return changes if len(changes) >= n_missed else None
 
 
@@ -96,6 +98,7 @@ class FollowedExclusions:
 
     def _read_again(self, store: Store, ids: set[int]) -> bool:
         """Read written objects; returns whether the words may choose otherwise now."""
+        # popped first: a removed object is in no result of the read below
         before = {i: self._objects.pop(i, None) for i in ids}
         now = {obj.id: obj for obj in store.objects(ids)}
         self._objects.update(now)

@@ -76,6 +76,7 @@ def _surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Su
     n_points = len(clusters.points)
     starts = np.arange(0, n_points, clusters.run)
     radii = clusters.spheres[:, 3] / voxel_size
+    # a large run would request all cells around its sphere: its points have fewer
     is_small = radii <= SMALL
     if not is_small.any():
         return Surroundings(clusters.points, 0.0, clusters.run, starts)
@@ -134,6 +135,7 @@ class ResidentFrames:
         out = np.zeros(len(matrices), RESULT)
         done = 0
         while done < len(matrices):
+            # as many poses as the table has room for: their cells must be resident together
             n_poses = self.fetch(matrices[done:])
             self._run(matrices, out, done, n_poses)
             done += n_poses
@@ -157,6 +159,7 @@ class ResidentFrames:
         """
         search = search or self.first_hits
         found = search(poses)
+        # a hit in a known cell decides alone; the rest needs its cells
         pending = np.flatnonzero(found == UNDECIDED)
         while len(pending):
             n_poses = self.fetch(poses[pending])
@@ -184,6 +187,7 @@ class ResidentFrames:
         # if the surroundings of the first pose do not fit into the table, its points alone may fit
         for places, reach in ((around.places, around.reach), (self.clusters.points, 0.0)):
             room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
+            # hash table: a power of two, several times the cells, so collisions are few
             found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
             n_poses, count = kernels.cells_in_reach(
                 places, 0, len(places), reach, poses, residency.cell_grid, found, most

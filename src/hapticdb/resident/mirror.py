@@ -80,13 +80,17 @@ class CellMirror:
             return 0
         cells, which = self._table.cells, version % BUFFERS
         keys, slots, words, gate, payload = self.arrays
+        # a dense list costs one access a lookup; the hash table of a large grid needs probes
         if self._across:
             slots.copy_to_device(self._listed(cells, which))
         else:
             keys.copy_to_device(np.ascontiguousarray(cells.keys[which : which + 1]))
             slots.copy_to_device(np.ascontiguousarray(cells.slots[which : which + 1]))
+        # by version, not by content: a slot is written once for each cell in it
         is_new = self._table.filled > self._version
+        # shared by all empty cells and never written
         is_new[EMPTY_SLOT] = False
+        # neighbours in one copy: each has the fixed cost of a transfer
         runs = _runs_of(np.flatnonzero(is_new))
         for first, end in runs:
             if self._has_distances and cells.payload is not None:
@@ -112,6 +116,7 @@ class CellMirror:
             if self._across:
                 found += [cells.keys[which][:1], cells.slots[which][:1]]
             parts = [np.ascontiguousarray(one) for one in found]
+            # made once: a recorded launch keeps their addresses
             if not arrays:
                 made = [cuda.device_array(one.shape, one.dtype) for one in parts]
                 keys, slots = made[1:] or self.arrays[:2]

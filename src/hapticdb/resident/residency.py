@@ -109,6 +109,7 @@ class Residency:
         self._urgent = NO_KEYS
         self._revision = NOTHING_KNOWN
         self._commit_count = NOTHING_KNOWN
+        # a table in use needs its cells at once: then no time to calibrate
         is_first = table.version == FIRST_VERSION
         self._excluded = FollowedExclusions(Filter(where, exclude))
         self._source = CellSource(store, self._excluded.ids, clock, may_measure=is_first)
@@ -137,10 +138,12 @@ class Residency:
             raise GridError(
                 f"{store.url} is another environment than before: start the session again"
             )
+        # a new file may have the same revision: the number alone proves nothing
         if store.identity != self.store.identity:
             self._revision = NOTHING_KNOWN
         self._source.store = store
         self._commit_count = NOTHING_KNOWN
+        # the lost connection may have ended a load between `take` and publication
         self.writer.slots.free_lost()
         self.refresh()
 
@@ -197,6 +200,7 @@ class Residency:
         """
         self.begin_round()
         missing = self.missing(cells)
+        # bounded: a load may evict cells of an earlier one, and writes of others make some unknown
         for _ in range(4 + 2 * len(missing) // BATCH):
             if not len(missing):
                 return
@@ -219,6 +223,7 @@ class Residency:
         If others have written meanwhile, their writes are followed in the same version, so that all
         resident cells have one revision.
         """
+        # in a small table a whole batch would evict most of the others
         cells = cells[: min(BATCH, max(self.table.n_slots // 4, 1))]
         self._make_room(len(cells))
         started = self._clock()
@@ -234,8 +239,10 @@ class Residency:
     def _read_now(self, cells: Keys) -> UnpublishedCells | None:
         """Read cells (n,) of the known revision; None if others have written since then."""
         read = self._read_batch(cells)
+        # optimistic: the read is outside a snapshot, and counts if nobody committed meanwhile
         if self.store.version() == self._commit_count:
             return read
+        # in no directory: free at once, no frame has seen them
         self.writer.slots.give_back(read.slots)
         return None
 
@@ -254,19 +261,24 @@ class Residency:
         The most urgent changed cells are read again, the others are forgotten. So memory and time
         are bounded for any amount of writes. Returns the number of writes, and all cells read.
         """
+        # one snapshot: revision, changes, exclusions and cells must agree
         with self.store.snapshot():
             revision = self.store.revision()
             writes = writes_since(self.store, self._revision, revision)
             only_written = self._excluded.follow(self.store, writes)
             self._source.exclude = self._excluded.ids
             self._check_distances(writes if only_written else None)
+            # other objects are felt than before: their cells are in no listed write,
+            # so all are doubtful
             if writes is None or not only_written:
                 touched = self.writer.known()
             else:
                 touched = known_cells_touched(writes, self.grid, self.slots_of, self.writer.known)
             again = self._urgent[np.isin(self._urgent, touched)][:MOST_RENEWED]
             read = self._read_all(np.concatenate([requested, again]))
+            # inside the snapshot: a commit right after it must differ from this number
             commit_count = self.store.version()
+        # only after the reads: an error above must leave the old revision
         self._revision, before = revision, self._revision
         self._commit_count = commit_count
         if len(touched) or len(read.cells) or revision != before:
@@ -296,6 +308,7 @@ class Residency:
             return UnpublishedCells()
         cells = cells[: len(slots)]
         is_empty, n_rows, n_ranges = self._source.read(cells, self.table, slots)
+        # after the read: its error leaves the slots free
         self.writer.slots.take(slots)
         self.writer.slots.give_back(slots[is_empty])
         slots[is_empty] = EMPTY_SLOT
@@ -303,6 +316,7 @@ class Residency:
 
     def _make_room(self, n_cells: int) -> None:
         """Free slots for `n_cells` cells, but none of a requested cell."""
+        # several batches at once: each eviction waits for the readers
         surplus = min(4 * BATCH, self.table.n_slots // 8)
         self.writer.evict_for(n_cells, surplus, self._urgent, self._revision)
 

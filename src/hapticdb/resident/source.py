@@ -67,18 +67,22 @@ class CellSource:
         """
         grid, shift = self.store.grid, row_shift(self.store.layout)
         on_curve = kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code)
+        # one ascending scan of the index; the ranges must be disjoint and ascending
         order = np.argsort(on_curve)
         on_curve = on_curve[order]
         lows = on_curve << (CELL_SHIFT - shift)
         highs = ((on_curve + 1) << (CELL_SHIFT - shift)) - 1
         words, masks, payload = table.cells.words, table.cells.masks, table.cells.payload
         costs = self._costs if payload is None else self._costs.with_distances
+        # joined ranges contain cells that nobody requested; their rows are dropped below
         ranges = cbgroup(lows, highs, self._quantiles, costs)
         rows = self.store.scan(*ranges, distances=payload is not None)
         cells_of_rows = rows.keys >> (CELL_SHIFT - shift)
+        # a row beyond the last requested cell would index past the end; the comparison rejects it
         at = np.minimum(np.searchsorted(on_curve, cells_of_rows), len(on_curve) - 1)
         is_included = (on_curve[at] == cells_of_rows) & ~np.isin(rows.ids, self.exclude)
         row_slots = np.where(is_included, slots[order][at], UNKNOWN)
+        # slots come back with the bits of an earlier cell
         words[slots] = 0
         masks[slots] = 0
         kernels.fill_cells(
@@ -131,6 +135,7 @@ def costs_at_start(
     if kept:
         return CostModel.from_figures(kept)
     where = store.url if scheme_of(store.url) else Path(store.url).absolute()
+    # by revision: another number of rows has other costs
     entry = entry_of("costs", str(where), store.revision(), machine_name())
     if (content := content_of(entry)) is not None:
         return CostModel.from_figures(json.loads(content))
@@ -148,4 +153,5 @@ def _round_trip(store: Store, clock: Callable[[], float]) -> float:
         started = clock()
         store.revision()
         times.append(clock() - started)
+    # the shortest: other work of the machine delays the rest
     return min(times)

@@ -100,6 +100,7 @@ def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
         raise UsageError(
             f"a budget of {budget_bytes} bytes for resident cells: give {LEAST_BUDGET} or more"
         )
+    # bisection: the capacity is a power of two, so the size has no inverse
     low, high = 1, budget_bytes // (4 * kernels.CELL_WORDS)
     while low < high:
         middle = (low + high + 1) // 2
@@ -156,6 +157,7 @@ class CellTable(Closes):
         table.cells.keys[:] = kernels.UNKNOWN
         table.cells.control["version"] = FIRST_VERSION
         if table.cells.payload is not None:
+            # frames read the empty slot like any other: no branch in the kernel
             table.cells.payload[kernels.EMPTY_SLOT] = BEYOND
         return table
 
@@ -190,6 +192,7 @@ class CellTable(Closes):
             free = np.flatnonzero(self.queue.pids == 0)
             if len(free):
                 row = int(free[0])
+                # before the pid: a row in use never shows the fields of its last session
                 self._clear(row)
                 sequence = self.queue.requests["sequence"]
                 sequence[row] += sequence[row] % 2  # odd if the last session died while it wrote
@@ -205,9 +208,11 @@ class CellTable(Closes):
     def release_dead(self) -> None:
         """Release the versions and sessions of dead readers; their rows stay in use."""
         pids = self.queue.pids
+        # the rows stay in use: their owner frees them, and may be another process than the reader
         dead = [pid for pid in set(pids.tolist()) - {0} if not is_alive(pid)]  # one may own many
         if dead:
             for row in np.flatnonzero(np.isin(pids, dead)).tolist():
+                # version 0: reads nothing, so the writer waits for no frame of this row
                 self.cells.readers["version"][row] = 0
                 self.queue.requests["prefetch"]["is_active"][row] = False
 
@@ -235,6 +240,7 @@ def is_alive(pid: int) -> bool:
         status = Path(f"/proc/{pid}/stat").read_text()
     except OSError:  # no such folder on this system, or another has just waited for a zombie
         return _exists(pid)
+    # the name before it is the process's own and may contain a parenthesis
     return status.rpartition(")")[2].split()[0] not in {"Z", "X"}
 
 

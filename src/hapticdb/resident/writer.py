@@ -42,6 +42,7 @@ class CellSlots:
         self._used = table.cells.used
         self._cell_of_slot = np.full(table.n_slots, UNKNOWN, dtype=np.int64)
         self._wanted_at = np.zeros(table.n_slots, dtype=np.int64)
+        # descending: slots leave from the end, the lowest first
         self._free = list(range(table.n_slots - 1, EMPTY_SLOT, -1))
         self._retired: deque[tuple[int, list[int]]] = deque()
         self._clock_hand = 0
@@ -98,6 +99,8 @@ class CellSlots:
         wanted = max(n_free - self.n_free, surplus)
         out = np.empty(wanted, dtype=np.int64)
         count = 0
+        # two passes of the clock: first cells that no recent round requested,
+        # then all but this round's
         for since in (self._round - ROUNDS_KEPT, self._round):
             found, self._clock_hand = kernels.slots_to_free(
                 self._cell_of_slot, self._wanted_at, self._used, since, self._clock_hand,
@@ -120,6 +123,7 @@ class CellSlots:
 
     def free_retired(self, oldest_version_read: int) -> None:
         """Free the retired slots out of reach of running frames."""
+        # epoch-based reclamation: versions ascend in the queue, so the first one decides
         while self._retired and self._retired[0][0] <= oldest_version_read:
             self._free += self._retired.popleft()[1]
 
@@ -135,6 +139,7 @@ class CellSlots:
         """Free the slots of a failed load."""
         retired = {slot for _, slots in self._retired for slot in slots}
         unnamed = np.flatnonzero(self._cell_of_slot == UNKNOWN).tolist()
+        # a retired slot has no cell either, but a frame may still read it
         self._free = [slot for slot in unnamed if slot != EMPTY_SLOT and slot not in retired]
 
     def warm_up(self) -> None:
@@ -221,6 +226,7 @@ class CellWriter:
         leaving = self.slots.cells_to_evict(n_free, surplus)
         if len(leaving):
             self.n_evicted += len(leaving)
+            # out of the directory first; the slots are free when no frame reads an older version
             self.publish(leaving, UnpublishedCells(), urgent, revision)
             self._wait_for_readers(self._table.version)
             self.slots.free_retired(self._oldest_version_read())
@@ -231,6 +237,7 @@ class CellWriter:
         urgent : last to be forgotten if too many are empty; revision : of the database,
         the same for all cells.
         """
+        # before any change: the published directory still has the cells that leave
         slots = self.slots_of(leaving)
         for cell in leaving[slots == EMPTY_SLOT].tolist():
             self._empty.pop(cell, None)
@@ -240,19 +247,25 @@ class CellWriter:
         new_empty = read.cells[~is_filled].tolist()
         forgotten = self._forget_for(len(new_empty), urgent)
         self.slots.fill(read.slots[is_filled], read.cells[is_filled])
+        # before the publication: a mirror that sees the version must also see its slots
         self._table.filled[read.slots[is_filled]] = self._table.version + 1
         self._empty.update(dict.fromkeys(new_empty))
         self._publish(np.concatenate([leaving, forgotten]), read, revision)
+        # after it: only now no new frame can find them
         self.slots.retire(cleared, self._table.version)
 
     def _publish(self, leaving: Keys, read: UnpublishedCells, revision: int) -> None:
         """Publish the next version of the directory."""
         version = self._table.version + 1
+        # the buffer of the next version is that of BUFFERS versions ago: no frame may read it now
         self._wait_for_readers(version - BUFFERS + 1)
         table, which = self._table.cells, version % BUFFERS
+        # this buffer is BUFFERS versions old: all changes since are applied again,
+        # so no table is copied
         changes = (*self._changes, (leaving, read))
         if self._n_unknown_copies:
             self._n_unknown_copies -= 1
+            # after a take-over the changes are unknown: a whole copy, once for each other buffer
             table.keys[which] = table.keys[(version - 1) % BUFFERS]
             table.slots[which] = table.slots[(version - 1) % BUFFERS]
             changes = changes[-1:]
@@ -260,6 +273,7 @@ class CellWriter:
             kernels.remove_cells(table.keys, table.slots, which, gone)
             kernels.insert_cells(table.keys, table.slots, which, new.cells, new.slots)
         self._changes.append((leaving, read))
+        # the one write that shows the new directory: until then readers use the old one
         kernels.publish(table.control, version, revision)
 
     def _forget_for(self, n_new: int, urgent: Keys) -> Keys:
@@ -273,6 +287,7 @@ class CellWriter:
         if surplus <= 0:
             return NO_KEYS
         known = self._known_empty()
+        # insertion order of the dict: the oldest first
         others = known[~np.isin(known, urgent)]
         oldest_kept = urgent[::-1][np.isin(urgent[::-1], known)]
         n_leaving = max(surplus, min(surplus + self._most_empty // 8, len(others)))
@@ -290,6 +305,7 @@ class CellWriter:
         waited_since = time.monotonic()
         while self._oldest_version_read() < version:
             time.sleep(PAUSE)
+            # a killed reader keeps its version for ever: look for dead processes
             if time.monotonic() - waited_since > TIMEOUT:
                 self._table.release_dead()
                 waited_since = time.monotonic()

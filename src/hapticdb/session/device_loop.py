@@ -107,6 +107,7 @@ class DeviceLoop:
         while time.monotonic() - started < WARM_TIMEOUT and not self._is_left():
             if control["is_lost"]:
                 break
+            # an answer to this request or a later one; an older one was about another pose
             if requested and session["heard"] >= requested:
                 if session["n_missing"] == 0:
                     self.is_warm = True
@@ -176,14 +177,17 @@ class DeviceLoop:
     def run(self) -> LoopFigures:
         """Run frames until the time is over, the device's script ends, or a stop is requested."""
         slot = self.slot
+        # kept alive by this local: the kernel holds the bare addresses alone
         called = self._called(self._read_hand), self._called(self._pusher())
         slot["reads"], slot["pushes"] = map(address_of, called)
         slot["is_frame"] = True
+        # the handler raises inside a call of the device: nothing else ends a hanging one
         before = signal.signal(signal.SIGTERM, self._end)
         try:
             seconds = self.clock.run(self.timing.rate, self.request.seconds)
         finally:
             signal.signal(signal.SIGTERM, before)
+        # the callback caught the exit as an error; the signal comes first
         if self._signal:
             signal.raise_signal(self._signal)
         if self._error is not None:
@@ -220,6 +224,7 @@ class DeviceLoop:
         """Function to push the device -> whether the loop ends."""
         device = self.device
         ends = device if isinstance(device, SupportsEnd) else None
+        # views taken once: no look-up by name in the servo loop
         applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], self.slot["n_frames"]
         poll_every = max(round(POLL_EVERY * self.timing.rate), 1)
 
@@ -227,10 +232,12 @@ class DeviceLoop:
             if self.gpu is not None:
                 self.gpu.check()
             device.apply(applied)
+            # NaN stands for an invalid reading: one of the three numbers is enough
             if math.isnan(x.item()) and self.bad_reading is None:
                 self.bad_reading = self.reader.fault() or None
             if ends is not None and ends.is_over:
                 return True
+            # a system call, so not in each period
             return n_frames.item() % poll_every == 0 and parent_is_gone()
 
         return push
@@ -280,9 +287,11 @@ def run_device(
         with undisturbed(timing.processor):
             empty = None
             if request.has_baseline:
+                # measured first: the machine's lateness alone, to be told from that of frames
                 seconds = min(EMPTY_SECONDS, request.seconds)
                 empty = empty_loop(clock.law, clock.rendering, timing.rate, seconds)
             loop.prepare()
+            # after `prepare`: the last step that may compile
             compiled = n_compiled()
             sender.send("running", loop.state.save())
             figures = loop.run()

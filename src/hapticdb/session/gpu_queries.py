@@ -123,6 +123,7 @@ class GpuQueries:
         self._launch_put_back()
         self._stream.synchronize()
         self._repeat()
+        # held in the object: the kernel has the bare address alone
         self._called = FUNCTION(self._answer)
         state.follower["gpu_query"] = address_of(self._called)
 
@@ -170,6 +171,7 @@ class GpuQueries:
     def _query_near_points(self) -> int:
         """Near points at the tried pose, as `query_proximity` -> OPEN, SHUT or NOT_KNOWN."""
         follower, state = self._follower, self._state
+        # the version of this frame, not the newest: tool and cells must be of one revision
         self._mirror.update(int(state.cells.readers["version"][state.reader]))
         self._mirror.seen()  # in the arrays that the launches read
         if self._n_queries % USED_EVERY == 0:
@@ -180,6 +182,7 @@ class GpuQueries:
         while True:
             n_due, n_near, n_unknown, least = self._query_once().tolist()
             n, numbers = int(n_near), self._view.points_near
+            # the query's writes go back first: a repeat must find the due times of before
             if n > numbers.size:
                 self._put_back(-1, n_due)
                 self._make_room(n)
@@ -188,14 +191,17 @@ class GpuQueries:
             shut = self._first_shut(numbers)
             if not (0 < most < n and follower.merged < MOST_MERGED):
                 break
+            # a forbidden point before the limit decides; then no merge is needed
             last = int(np.partition(numbers, most)[most])
             if shut < last:
                 break
             self._put_back(last, n_due)
             follower.merged[()] *= 2
+        # points beyond the first forbidden one keep their state, as if never queried
         if shut < NOBODY:
             self._put_back(shut, n_due)
             return SHUT
+        # blocks append in any order: sorted, so the sums round alike in each run
         order = np.argsort(numbers)
         rows, first = self._view.near[:, order].T, kernels.CURVATURE
         near["point"][:n], near["is_hollow"][:n] = numbers[order], rows[:, first] > 0.0
@@ -246,6 +252,7 @@ class GpuQueries:
             place, seen, self._mirror.arrays[-1], view
         )
         view.found.copy_to_host(self._found, stream=stream)
+        # in this launch: the next query finds cleared sums without another copy
         view.found.copy_to_device(self._nothing, stream=stream)
 
     def _launch_put_back(self) -> None:
@@ -261,6 +268,7 @@ class GpuQueries:
     def _make_room(self, n: int) -> None:
         """Make room for n near points."""
         room = 1 << (n - 1).bit_length()
+        # new arrays have other addresses: the recorded launches are taken again
         self._view = self._view._replace(
             points_near=cuda.mapped_array(room, np.int64),
             near=cuda.mapped_array((kernels.NEAR_NUMBERS, room), np.float64),

@@ -113,6 +113,7 @@ class SessionHost(Closes):
         with self._changing, ExitStack() as undo:
             if self._is_closed:
                 raise UsageError("the host is closed: make another")
+            # first, so it runs last: a table made for a failed session has no user
             undo.callback(self._free_tables)
             cells = self._cells_of(selection)
             law = DISTANCE if cells.has_distances else PLANE
@@ -124,15 +125,18 @@ class SessionHost(Closes):
             )
             worker, number = self._least_busy(law, rendering), next(self._ids)
             running = Running(number, self._shared, cells, shell, settled)
+            # a failure of the worker below must return the slot and the reader row
             undo.callback(running.close)
             running.worker = worker
             hand = np.array(row_of_pose(pose))
+            # before `begin`: from then on the worker's loop may read it
             self._shared.slots["hand_pose"][running.slot] = hand
             table = cells.table
             worker.call(
                 "begin", running.request, hand, id(cells), table.n_slots,
                 descriptors=[table.descriptor],
             )  # fmt: skip
+            # last: from here on the supervisor records its frames, and `end` finds it
             self._supervisor.sessions[number] = running
             undo.pop_all()
         return HostedSession(self._shared, running.slot, number, self._call)
@@ -162,6 +166,7 @@ class SessionHost(Closes):
             self._workers.remove(worker)
             worker.end()
         counts = {
+            # from the slots, not from a counter: a loop leaves an ended session by itself
             worker: int(np.count_nonzero(self._shared.slots["worker"] == worker.request.number))
             for worker in self._workers
             if (worker.request.law, worker.request.rendering) == (law, rendering)
@@ -192,6 +197,7 @@ class SessionHost(Closes):
 
     def _end(self, running: Running) -> Recorded:
         """End a session, working or not; returns the size of its recording."""
+        # before the end: the supervisor must not read a slot that is free
         self._supervisor.sessions.pop(running.session, None)
         try:
             return running.end()
@@ -222,8 +228,10 @@ class SessionHost(Closes):
         """End all sessions, processes and recordings; a second call does nothing."""
         if os.getpid() != self._pid or self._is_closed:
             return
+        # before the lock: a `begin` that waits for the lock is refused then
         self._is_closed = True
         with self._changing, ExitStack() as ends:
+            # a stack runs backwards: sessions first, then sockets, workers, and tables at last
             for cells in self.cells:
                 ends.callback(cells.close)
             for worker in self._workers:

@@ -148,12 +148,14 @@ class _Again:
     def run(self, frames: Frames) -> Frames:
         """Run frames with the inputs of the recorded ones."""
         state, residency = self._state, self._residency
+        # saved: a block with unknown cells is run again, from the same state
         before, wanted = state.save(), self._around(frames)
         residency.make_resident(wanted)
         while True:
             missed = self._run(frames)
             if not len(missed):
                 return self._ring[0, : len(frames)]
+            # no progress: the cells were requested and evicted again, so a repeat would not end
             if np.isin(missed, wanted).all():
                 raise HapticDBError(f"cells {missed[:3].tolist()} do not stay in memory")
             wanted = np.union1d(wanted, missed)
@@ -185,6 +187,7 @@ class _Again:
         for n, frame in enumerate(frames):
             self._hand[:], hand.velocity[:] = frame["hand"], frame["hand_velocity"]
             hand.is_open[()] = is_open[n]
+            # the limit decides in place of the clock, which is another one now
             slot.staleness[()] = -NEVER_NS if is_stale[n] else NEVER_NS
             slot.springs[0] = frame["spring"]
             slot.reading.buttons[()] = frame["buttons"]
@@ -215,6 +218,7 @@ class _Comparison:
                 np.ascontiguousarray(of[name]).view(np.uint8).reshape(len(of), -1)
                 for of in (recorded, present)
             )
+            # bytes, not numbers: NaN equals NaN, and 0.0 differs from -0.0
             differs |= (then != now).any(axis=1)
         if self._parting is None:
             self._find_reasons(recorded)
@@ -233,6 +237,7 @@ class _Comparison:
         now, times = self._residency.revision, frames["time"]
         begun = times[0] - frames["dt"][0] if self._last is None else self._last
         begins = np.append(begun, times[:-1])
+        # a frame begins where the last one ended; a hole means lost ones
         gaps = np.abs(times - begins - frames["dt"]) > 1e-7
         self._last = float(times[-1])
         for kind, found, words in (

@@ -41,6 +41,7 @@ class Running(Closes):
         self.recording: Recorder | None = None
         self._taking = threading.Lock()
         with ExitStack() as undo:
+            # on a stack: the reader row goes back if no slot is free
             reader = cells.table.join()
             undo.callback(cells.table.leave, reader)
             self.slot = shared.take(session)
@@ -59,6 +60,7 @@ class Running(Closes):
     @worker.setter
     def worker(self, worker: WorkerProcess) -> None:
         self._worker = worker
+        # the worker reads the cells: its death frees the row's version
         self.cells.table.queue.pids[self.request.reader] = worker.pid
 
     @property
@@ -117,6 +119,7 @@ class Running(Closes):
             self.take_frames()
         finally:
             with self._taking:
+                # under the lock: the supervisor may be in the middle of a block of frames
                 recording, self.recording = self.recording, None
             if recording is not None:
                 recording.finish()
@@ -132,11 +135,13 @@ class Running(Closes):
         worker, until = self.shared.slots["worker"], time.monotonic() + END_TIMEOUT
         with self:
             try:
+                # the loop clears the field; a dead worker never does
                 while worker[self.slot] and self._worker is not None and self._worker.is_alive:
                     if time.monotonic() > until:
                         raise HapticDBError("a worker's loop hangs: end the host")
                     time.sleep(1e-3)
             finally:
+                # after the last frame, before the slot is given to another session
                 recorded = self.stop_recording()
         return recorded
 

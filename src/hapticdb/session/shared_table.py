@@ -85,6 +85,7 @@ class SharedTable(Closes):
             row = int(free[0])
             self.slots[row] = np.zeros((), SLOT)
             self.slots["id"][row] = session
+            # state last: readers in other processes do not take this lock
             self.slots["state"][row] = TAKEN
             return row
 
@@ -102,6 +103,7 @@ class SharedTable(Closes):
     def put_hand(self, row: int, time: int, pose: NDArray[np.float64]) -> None:
         """Write the hand's pose (7,) and its time."""
         slots = self.slots
+        # seqlock: an odd number during the write; one writer, no lock in the servo loop
         slots["hand_sequence"][row] += 1
         slots["hand_pose"][row] = pose
         slots["hand_time"][row] = time
@@ -125,6 +127,7 @@ class SharedTable(Closes):
         slots = self.slots
         for _ in _attempts():
             before = int(slots["contacts_sequence"][row])
+            # a torn count is possible here; the second reading of the number rejects it
             n_contacts = min(int(slots["n_contacts"][row]), MOST_SHOWN)
             found: NDArray[np.float64] = slots["contacts"][row, :n_contacts].copy()
             if before % 2 == 0 and before == int(slots["contacts_sequence"][row]):

@@ -75,6 +75,7 @@ class SessionState:
         self.kept = np.zeros(n_points, POINT)
         self.near_points, self.bends = np.zeros((2, n_points), NEAR), np.zeros((2, n_points), BENDS)
         self.missed = np.zeros((), MISSED)
+        # held here: the slot has bare addresses, and the collector does not see them
         self._arrays = {
             name: np.ascontiguousarray(array)
             for name, array in clusters._asdict().items()
@@ -86,6 +87,7 @@ class SessionState:
         }  # fmt: skip
         for name, arrays in (("arrays", self._arrays), ("cells", cells._asdict())):
             for field, array in arrays.items():
+                # address 0 stands for a missing array: cells without distances
                 slot[name][field] = 0 if array is None else array.ctypes.data
         for field, value in (
             ("reader", reader), ("request", request.ctypes.data), ("staleness", STALENESS_NS),
@@ -100,6 +102,7 @@ class SessionState:
 
     def set_spring(self, spring: DeviceSpring) -> None:
         """Replace the coupling; periods take the new one whole."""
+        # double buffer: the index is written last, so no period reads half of a spring
         which = 1 - int(self.slot["spring"])
         self.slot["springs"][which] = spring
         self.slot["spring"] = which
@@ -119,6 +122,7 @@ class SessionState:
 
     def restore(self, saved: Start) -> None:
         """Continue from a result of `save`, for the same tool and build."""
+        # an address of this process must not come back from a saved one
         gpu_query, parts = (
             self.follower["gpu_query"].copy(),
             (self.servo, self.follower, self.kept, self.near_points, self.bends),
@@ -175,12 +179,14 @@ class PeriodClock:
 
     def enter(self, state: SessionState) -> None:
         """Run the periods of a session."""
+        # the slot must be complete: a running loop reads it from here on
         state.slot["worker"] = self.worker
 
     def leave(self, state: SessionState) -> None:
         """Run no more periods of a session; the loop of another thread leaves it within two."""
         state.slot["worker"] = 0
         periods = self._record["periods"]
+        # two periods: the one under way may have read the field before the write above
         last, until = int(periods) + 2, time.monotonic() + LEAVE_TIMEOUT
         while int(periods) < last:
             if time.monotonic() > until:
@@ -195,6 +201,7 @@ class PeriodClock:
         """
         begun, record = time.monotonic_ns(), self._record
         own = self.slots["worker"] == self.worker
+        # sessions that waited for the loop have their first period from now on
         self.slots["began"][own] = self.slots["last"][own] = begun
         record["period"], record["most"] = round(1e9 / rate), max(round(seconds * rate), 1)
         record["due"] = begun + record["period"]

@@ -43,8 +43,10 @@ class Supervisor(Closes):
             look()
 
     def _supervise_sessions(self) -> None:
+        # a copy: sessions begin and end in other threads
         for running in list(self.sessions.values()):
             with self._surviving("recording a session"):
+                # a dead worker writes no frame: its clients must not wait for one
                 if running.worker.is_alive:
                     running.take_frames()
                 else:
@@ -71,6 +73,7 @@ class Supervisor(Closes):
 
     def close(self) -> None:
         """End the threads and all sessions, each even if another fails at it."""
+        # threads first: none may read a slot that is freed below
         self._is_closed.set()
         for thread in self._threads:
             with suppress(RuntimeError):

@@ -95,6 +95,7 @@ class Worker:
         except (EOFError, OSError):
             pass
         finally:
+            # always: the loop's thread would run on in a process without a parent
             self._clock.stop()
 
     def _do(self, message: Message, descriptors: list[int]) -> object:
@@ -116,10 +117,12 @@ class Worker:
         if table not in self._tables:
             self._tables[table] = CellTable(os.dup(descriptor), n_slots)
         state = self._clock.add(request, self._tables[table])
+        # all of the state before `enter`: the loop's thread takes the session without a lock
         state.rest_at(pose)
         state.arrive_at(pose)
         state.slot["is_frame"] = True
         state.slot["began"] = state.slot["last"] = time.monotonic_ns()
+        # held here: the loop has bare addresses of its arrays
         self._running[request.slot] = table, state
         self._clock.enter(state)
 
@@ -129,6 +132,7 @@ class Worker:
     def _save(self, slot: int) -> tuple[int, Start]:
         """Number of a session's next frame, and its state before that frame."""
         state = self._running[slot][1]
+        # between two periods: a copy during one would mix two frames
         self._clock.leave(state)
         try:
             return int(state.slot["n_frames"]), state.save()
@@ -138,6 +142,7 @@ class Worker:
     def _forget_ended(self) -> None:
         """Free the memory of sessions that the loop has left."""
         for slot, (_, state) in list(self._running.items()):
+            # only after the loop has left: it must not read freed memory
             if state.slot["worker"] != self._clock.worker:
                 del self._running[slot]
         for table in self._tables.keys() - {table for table, _ in self._running.values()}:
@@ -157,6 +162,7 @@ def work(request: WorkerRequest, sender: MessageSender) -> None:
         run_device(request.alone, timing, clock, sender)
         return
     worker = Worker(timing.rate, clock)
+    # beside the main thread: the kernel returns at the end, commands come before
     looping = threading.Thread(target=worker.run, daemon=True)
     looping.start()
     sender.send("ready", None)

@@ -70,6 +70,7 @@ class Filter:
         out = {obj.id for obj in _chosen(listing, "exclude", self.exclude, missing)}
         if self.where:
             selected = {obj.id for obj in _chosen(listing, "where", self.where, missing)}
+            # the others become exclusions: statements and frames know only these
             out.update(obj.id for obj in objects if obj.id not in selected)
         return ExcludedObjects(np.array(sorted(out), dtype=np.int64), tuple(missing))
 
@@ -109,6 +110,7 @@ class FiltersOfWords:
 
     def of(self, where: Words, exclude: Words) -> Filter:
         """The filter of these words, cached; UsageError as for `Filter`."""
+        # an iterator can be read once: no key for the cache
         if not isinstance(where, (tuple, list)) or not isinstance(exclude, (tuple, list)):
             return Filter(where, exclude)
         if not where and not exclude:

@@ -95,6 +95,8 @@ class Mark(NamedTuple):
         cls, found: Sequence[tuple[str, int]], was: "MaybeMark", now: "MaybeMark"
     ) -> tuple["MaybeMark", PairRow]:
         """Result of `put_pairs`, and its row of the mark; found : the present row, or none."""
+        # compare and swap: another writer since the read has replaced the mark;
+        # then no mark is true, and a random one forces the next search to look at all
         found_mark = cls(*found[0]) if found else cls()
         mark = (
             now if now is not None and found_mark == was else cls(f"written {os.urandom(8).hex()}")
@@ -118,6 +120,7 @@ class StoredPairs:
     def __init__(
         self, rows: Sequence[Sequence[Any]], checked: Callable[[Sequence[Any]], PairRow]
     ) -> None:
+        # ordered by (a, b): the mark's key sorts before every pair
         has_mark = bool(rows) and rows[0][A] == MARK[0]
         row = checked(rows[0]) if has_mark else None
         self.mark = Mark() if row is None else Mark(row.setting, row.revision)

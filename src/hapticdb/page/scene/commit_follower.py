@@ -68,6 +68,7 @@ class Follower:
 
     def _catch_up(self, env: Environment) -> None:
         """Report the commits since the last reported revision."""
+        # revision and objects of one snapshot: a commit between them would be missed
         with env.store.snapshot():
             revision = env.store.revision()
             if revision == self._revision:
@@ -80,8 +81,10 @@ class Follower:
                 ids = {change.id for change in changes}
                 there = env.store.objects(ids)
                 gone = ids - {obj.id for obj in there}
+        # after a lost connection all objects are read: those already reported are left out
         written = [obj for obj in there if self._revisions.get(obj.id) != obj.revision]
         removed = [i for i in gone if self._revisions.pop(i, None) is not None]
         self._revisions.update({obj.id: obj.revision for obj in written})
+        # after the reads: an error above leads to the same writes again
         self._revision = revision
         self._on_change(written, removed, revision)

@@ -28,6 +28,7 @@ class Contents:
     """
 
     def __init__(self, audience: Audience) -> None:
+        # reentrant: `add` calls `remove` and `refresh` under it
         self.lock = RLock()
         self.records: dict[int, Object] = {}
         """Objects by id, as last read from the database."""
@@ -75,10 +76,12 @@ class Contents:
         with self.lock:
             members = []
             for read, shape, pose in found:
+                # shapes are read in another thread: the object may have changed since
                 now = self.records.get(read.id)
                 if now is None or not (now is read or is_same_shape(now, read)):
                     continue
                 member = self._members[read.id]
+                # a preview or a commit meanwhile: rigid, so the shape is only carried along
                 moved = motion(read.transform, self._preview.get(read.id, now.transform))
                 member.shape, member.pose = shape, moved @ pose
                 member.box = shape.bounds(member.pose)
@@ -101,6 +104,7 @@ class Contents:
                 return False
             base = self.records[object_id].transform
             member = self._members[object_id]
+            # relative to what is shown: previews do not add up on the record
             at = self._preview.get(object_id, base)
             member.pose = motion(at, placed) @ member.pose
             if record is None:
@@ -118,6 +122,7 @@ class Contents:
     def _moved(self, member: Member) -> None:
         home = self._home[member.id]
         self._targets.changed()
+        # a merged mesh is sent whole at each move: out of it at the first one
         if not home.is_cheap_to_move and member.shape and len(self._loose) < MOST_SINGLE:
             self._leave(member.id)
             self._loose.add(member.id)
@@ -169,6 +174,7 @@ class Contents:
     def refresh(self) -> None:
         """Redraw changed nodes for all audiences."""
         with self.lock:
+            # collected: several changes of a node are one drawing
             stale, self._stale = self._stale, {}
             for node in stale.values():
                 for audience, appearance in self._audiences.values():
@@ -182,6 +188,7 @@ class Contents:
         wanted: Mapping[str, Drawing | PointDrawing] = (
             node.drawings(appearance) if node.members else {}
         )
+        # first in the dict, so `_shown` is new when the browsers are compared with it
         if audience is self._audiences[ALL][0]:
             before = self._shown.pop(node.name, {})
             for name in before.keys() - wanted.keys():
@@ -192,8 +199,10 @@ class Contents:
                 audience.put(name, drawing)
             return
         shared = self._shown.get(node.name, {})
+        # what this browser has of the node by itself: put or blanked earlier
         own = {name for name in audience.names if name.partition("-")[0] == node.name}
         for name in wanted.keys() | shared.keys() | own:
+            # copy on write: a browser gets a node of its own only where its view differs
             if name in wanted and not (name in shared and wanted[name].equals(shared[name])):
                 audience.put(name, wanted[name])
             elif name in shared and name not in wanted:

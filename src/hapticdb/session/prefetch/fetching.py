@@ -145,6 +145,7 @@ class Fetcher:
 
     def round(self) -> bool:
         """Follow writes, fetch a batch, name objects; returns whether any cell was fetched."""
+        # `begun` is read before any query: the heartbeat must not be newer than its answer
         before, self._now = self._now, self._clock()
         begun = time.monotonic_ns()
         self._is_confirmed = False
@@ -152,6 +153,7 @@ class Fetcher:
             self.residency.refresh()
             self._is_confirmed = True
             self._answers.forget()
+        # after the writes: `load` then seldom has to follow any itself
         is_busy = self._bring_in(self._now - before)
         if self._now - self._queried_at >= POLL_EVERY:
             self._queried_at = self._now
@@ -181,6 +183,7 @@ class Fetcher:
         """Whether others have written; queries the database only as often as the engine needs."""
         if self.store.has_changed():
             return True
+        # no notification is no proof of life: a lost server is silent, too
         if self._now - self._confirmed_at < CONFIRM_EVERY:
             return False
         self._is_confirmed = True
@@ -191,12 +194,15 @@ class Fetcher:
         has_moved = self.tracker.read_queue(elapsed, self.lookahead)
         missing = NO_KEYS
         has_new_cells = self._version_seen != self.table.version
+        # at rest nothing is looked up: the last result still holds
         if has_moved or has_new_cells or self.tracker.has_unknown_cells():
             self._version_seen = self.table.version
             missing = self.tracker.missing_cells(self.residency)
+        # also without a batch: a loop that waits for its cells reads this number
         self.tracker.report_missing()
         if not len(missing):
             return False
+        # one batch a round: the order of urgency follows the hand, not an old request
         loaded = self.residency.load(missing[:BATCH])
         self._is_confirmed |= loaded.ranges > 0  # without room in the table, no query is sent
         self._record_figures(loaded)
@@ -222,6 +228,7 @@ class Fetcher:
         # Close only now: while the old file is open, no other file can have the same identity.
         self.close()
         self.store = opened
+        # the next round queries the revision, so the mark of the loss goes at once
         self._confirmed_at = -np.inf
         self.residency.reopened(self.store)
         self.store.watch(is_prompt=True)
@@ -241,6 +248,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
     another grid, UsageError if the table has distances and an object was written that has none.
     """
     table = request.table
+    # a table of an earlier process serves sessions already: then a lost database ends nothing
     is_first = table.version == FIRST_VERSION
     fetcher: Fetcher | None = None
     timeout, at_most = RETRY
@@ -274,6 +282,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
                     table.queue.figures["losses"] += 1
             is_lost = True
             time.sleep(timeout)
+            # exponential back-off, reset by the first complete round
             timeout = min(2 * timeout, at_most)
     if fetcher is not None:
         fetcher.close()

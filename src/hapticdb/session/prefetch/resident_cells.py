@@ -127,6 +127,7 @@ class ResidentCells(Closes):
         self.filter = Filter(where, exclude)
         prepare(FETCH, with_kernels=True)  # while the environment is read
         self.grid, has_distances = self._read_environment(distances)
+        # made here, not by the prefetch process: it survives that process's death
         self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
         self._request = FetchRequest(url, self.table, self.grid, self.filter, wrap)
@@ -266,8 +267,10 @@ class ResidentCells(Closes):
 
     def close(self) -> None:
         """End the prefetch process and free the memory; does nothing in a forked copy."""
+        # the table and process are shared with the parent: a forked copy ends neither
         if os.getpid() != self._pid:
             return
+        # before the lock: from now on `supervise` starts no further process
         self.table.cells.control["is_over"] = 1
         with self._supervising:
             self._process.end(END_TIMEOUT)

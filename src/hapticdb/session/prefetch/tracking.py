@@ -75,6 +75,7 @@ class PrefetchRequest(NamedTuple):
         radius, size = float(record["radius"]), grid.voxel_size
         if not np.isfinite([*tool, *handle, *velocity, radius]).all():
             return None
+        # the lower bound serves a hand at rest: it may start within the look-ahead time
         margin = max(1.5 * peak_speed / size, REACH_VOXELS) * lookahead
         return cls(
             (tool - np.array(grid.origin)) / size,
@@ -99,10 +100,13 @@ class PrefetchRequest(NamedTuple):
         sphere's path until it is nearest.
         """
         n_cells = max(grid.side >> CELL_BITS, 1)
+        # the cells also serve each request that `is_near` accepts:
+        # both ends may differ by the slack
         reach = self.radius + self.margin + 2.0 * SLACK_VOXELS
         end = self.start + self.move
         low = np.floor((np.minimum(self.start, end) - reach) / CELL)
         high = np.floor((np.maximum(self.start, end) + reach) / CELL)
+        # clipped as floats: a far hand would overflow int64
         first = np.clip(low, 0, n_cells).astype(np.int64)
         last = np.clip(high, -1, n_cells - 1).astype(np.int64)
         if (first > last).any():
@@ -112,6 +116,7 @@ class PrefetchRequest(NamedTuple):
         keys, urgency = np.empty(room, dtype=np.int64), np.empty(room)
         margin = self.margin + 2.0 * SLACK_VOXELS
         count = cells_ahead(first, last, self.start, self.move, self.radius, margin, keys, urgency)
+        # stable: equal urgency keeps one order, so batches repeat
         order = np.argsort(urgency[:count], kind="stable")
         return keys[:count][order], urgency[:count][order]
 
@@ -119,6 +124,7 @@ class PrefetchRequest(NamedTuple):
         """Cut a box of too many cells, first .. last, at its far ends; in place."""
         spans = last - first + 1
         while np.prod(spans) > MOST_CELLS_WANTED:
+            # the longest axis loses its end farther from the tool: the hand arrives there last
             axis = int(np.argmax(spans))
             middle = self.start[axis] / CELL
             if middle - first[axis] > last[axis] - middle:
@@ -168,6 +174,7 @@ class SessionTracker:
                 continue
             speed = float(np.linalg.norm(record["velocity"]))
             if np.isfinite(speed):
+                # peak hold with decay: a hand that reverses is slow for a moment only
                 session.speed = max(speed, session.speed * 0.5 ** (elapsed / SPEED_HALF_LIFE))
             request = PrefetchRequest.of_record(self._grid, record, lookahead, session.speed)
             if request is None or (
@@ -183,6 +190,8 @@ class SessionTracker:
         """Read a row of the queue completely; None if its loop died while it wrote the row."""
         queue = self._table.queue.requests
         for _ in range(READ_ATTEMPTS):
+            # seqlock: odd while the loop writes; a copy counts if the number
+            # was even and has not changed
             session.sequence = int(queue["sequence"][row])
             record: NDArray[np.void] = queue["prefetch"][row, ...].copy()
             if session.sequence % 2 == 0 and session.sequence == queue["sequence"][row]:
@@ -199,6 +208,7 @@ class SessionTracker:
 
     def missing_cells(self, residency: Residency) -> Keys:
         """Unknown cells of all requests, most urgent first; protects the resident ones."""
+        # first, so that all requests of this round are protected together
         residency.begin_round()
         wanted = [part for row in self.sessions for part in self._wanted(row, residency)]
         return residency.missing(ranked(wanted))
@@ -206,6 +216,7 @@ class SessionTracker:
     def _wanted(self, row: int, residency: Residency) -> Iterator[Ranked]:
         """Cells of one session: as many as its share of the table has room for."""
         table, session = self._table, self.sessions[row]
+        # equal shares: one fast hand must not take the slots of all others
         share = SHARE_OF_TABLE / len(self.sessions)
         cells = session.cells[: int(share * (table.capacity // 2 - table.n_slots))]
         slots = residency.slots_of(cells)
@@ -217,6 +228,8 @@ class SessionTracker:
         table.queue.figures["wanted"] += len(cells)
         table.queue.figures["granted"] += len(cells) - len(unknown)
         session.n_missing = len(unknown)
+        # unknown cells of the last frame come before all others:
+        # there the prediction was wrong
         unknowns = table.queue.requests["missed"][row]
         if n_missed := int(unknowns["n_cells"]):
             missed = np.unique(unknowns["cells"][:n_missed])
@@ -227,6 +240,8 @@ class SessionTracker:
         """Report the number of missing cells to each session, with the number of its request."""
         queue = self._table.queue.requests
         for row, session in self.sessions.items():
+            # number before `heard`: who sees its request answered must not read
+            # the number of an older one
             queue["n_missing"][row] = session.n_missing
             queue["heard"][row] = session.sequence
 
@@ -239,6 +254,7 @@ def ranked(wanted: Sequence[Ranked]) -> Keys:
     order = np.argsort(np.concatenate([urgency for _, urgency in wanted]), kind="stable")
     if len(wanted) > 1:
         _, first = np.unique(cells[order], return_index=True)
+        # `unique` sorts by key; the first places restore the order of urgency
         order = order[np.sort(first)]
     return cells[order]
 
@@ -268,9 +284,11 @@ class ObjectAnswers:
                 self._queue["n_objects"][row] = 0
                 continue
             keys = np.unique(self._queue["asked"][row, :n_asked])
+            # a hand at rest asks for the same voxels: one query until a commit
             question = keys.tobytes()
             if before.get(row) != question:
                 ids = self.ids_of(store, keys)[:MOST_OBJECT_REQUESTS]
+                # ids before their number: it never covers an id that is not written yet
                 self._queue["objects"][row, : len(ids)] = ids
                 self._queue["n_objects"][row] = len(ids)
             self._answered[row] = question

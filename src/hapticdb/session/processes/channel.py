@@ -40,11 +40,13 @@ class Channel:
         """Send a message, and file descriptors with it."""
         packed = pickle.dumps(content)
         whole = len(packed).to_bytes(HEADER, "little") + packed
+        # descriptors go with the first part of a large message; the rest follows alone
         sent = socket.send_fds(self.sock, [whole], list(descriptors))
         self.sock.sendall(memoryview(whole)[sent:])
 
     def receive(self) -> tuple[Any, list[int]]:
         """Next message and the descriptors with it; EOFError if the other process has gone."""
+        # no more than the header: the next message may already be behind this one
         header, descriptors, _, _ = socket.recv_fds(self.sock, HEADER, MOST_DESCRIPTORS)
         header += self._receive_exactly(HEADER - len(header))
         packed = self._receive_exactly(int.from_bytes(header, "little"))
@@ -55,6 +57,7 @@ class Channel:
 
         Raises the other process's error, or `HapticDBError` if it has ended or does not answer.
         """
+        # answers carry no number: one request in flight pairs them
         with self._requesting:
             try:
                 self.send(Message(word, content), descriptors)

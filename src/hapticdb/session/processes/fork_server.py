@@ -139,6 +139,7 @@ def start(
     if the server does not answer.
     """
     wanted = _order(work, numbers, with_kernels=with_kernels)
+    # a descriptor, not a path: the folder may be renamed before the fork
     folder = os.open(".", os.O_PATH)
     try:
         number, standing = _answered(wanted, [*streams, folder, *numbers])
@@ -182,6 +183,7 @@ def serve(descriptor: int, owner: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(ProcessLookupError):
         owning = os.pidfd_open(owner)
+        # the owner may have died before the pidfd, and another process have its id
         if os.getppid() == owner:
             _serve(Channel(socket.socket(fileno=descriptor)), owning)
 
@@ -226,6 +228,7 @@ def _load(work: str, *, with_kernels: bool) -> None:
         import_module(work.partition(":")[0])
         if with_kernels:
             import_module("hapticdb.kernels._jit").load_entries()
+        # copy on write: a collection writes to the header of each tracked object
         gc.freeze()  # collections in copies leave these pages shared
 
 
@@ -247,11 +250,13 @@ def _become(wanted: Order, descriptors: list[int], owning: int) -> None:
     os.setsid()
     resource.setrlimit(resource.RLIMIT_NOFILE, wanted.most_files)
     targets = [0, 1, 2, *(wanted.numbers or ())]
+    # first above all targets, then down: a direct dup2 could close a source that is still needed
     first = max(targets) + 1
     owning, *descriptors = [fcntl.fcntl(n, fcntl.F_DUPFD, first) for n in (owning, *descriptors)]
     os.fchdir(descriptors.pop(3))
     for number, target in zip(descriptors, targets, strict=True):
         os.dup2(number, target)
+    # the copy must hold no channel of a sibling: its end of file would never come
     kept = [*sorted(targets), owning]
     for below, above in zip(kept, [*kept[1:], wanted.most_files[0]], strict=True):
         os.closerange(below + 1, above)

@@ -55,6 +55,7 @@ class Process:
             channel.close()
             raise
         finally:
+            # only the child holds this end now: its death is an end of file here
             theirs.close()
         with contextlib.suppress(OSError):  # the child died at once; `receive` reports that
             channel.send(content)
@@ -116,11 +117,13 @@ class Process:
     def wait(self, seconds: float) -> bool:
         """Wait for the end of the process; returns whether it ended in `seconds`."""
         ended = select.poll()
+        # a pidfd, not the pid: the child is the fork server's, and a pid may be reused
         ended.register(self._standing, select.POLLIN)
         return bool(ended.poll(1000.0 * seconds))
 
     def end(self, timeout: float = END_TIMEOUT) -> None:
         """End the process: close its channel, and kill it if it runs `timeout` s later."""
+        # the end of file asks the process to stop: its `finally` blocks still run
         self._channel.close()
         if not self.wait(timeout):
             with contextlib.suppress(ProcessLookupError):
@@ -156,7 +159,9 @@ def run(module: str, name: str, starter: int) -> None:
     global _parent  # noqa: PLW0603 - one a process
     _parent = Channel(socket.socket(fileno=os.dup(0)))
     _ends.register(_parent.sock, 0)  # its end, which is always told
+    # and its death: a forked copy of the parent would keep the channel open
     _ends.register(starter, select.POLLIN)
+    # Ctrl-C is the parent's: this process ends with its channel
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     status = 0
     sender = MessageSender(_parent)

@@ -82,12 +82,14 @@ def create_partitions(
     made: list[ServerConnection] = []
     try:
         for partition in partitions:
+            # noted before the write: `_undo` must also drop a partition that is half made
             made.append(connect(partition))
             made[-1].write(lambda: _make_partition(made[-1], layout))
     except BaseException:
         _undo(made)
         raise
 
+    # no two-phase commit: the partitions are committed before, and dropped if the rest fails
     def join(connection: ServerConnection) -> None:
         try:
             _join(connection, made, grid, layout)
@@ -164,6 +166,7 @@ def _join(
         connection.execute(inherits.format(*place))
     connection.execute(f"DROP TABLE {layout}")
     for statement in _statements(layout):
+        # PostgreSQL allows no unique index on a table with foreign partitions
         if "CREATE UNIQUE INDEX" not in statement:
             by_range = re.sub(r"WITH \(.*\)", "PARTITION BY RANGE (z_val)", statement)
             connection.execute(by_range)

@@ -96,10 +96,12 @@ class PostgresStore(ServerTables):
         """As of the base; those of partitions begin one after the other on entry."""
         with self._connection.snapshot():
             if self._is_partitioned:
+                # reads every partition: each remote snapshot begins with the first statement there
                 self._connection.rows(SIZE_OF_PARTITIONS)
             yield
 
     def newest(self) -> int:
+        # notifications arrive between transactions alone
         if self._connection.is_in_transaction:
             return self.revision()
         if self._watch.poll():
@@ -173,6 +175,7 @@ class PostgresStore(ServerTables):
         """A statement and its parameters with the condition on excluded objects."""
         if not exclude.size:
             return text, parameters
+        # by identity: most frames exclude the same array, and packing it takes time each frame
         if exclude is not self._excluded:
             self._excluded, self._excluded_parameters = exclude, _excluded_parameters(exclude)
         leave_out = statements.without_excluded

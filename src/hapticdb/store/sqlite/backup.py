@@ -43,8 +43,10 @@ def back_up(
     _check_target(source, real, replace=replace)
     with sqlite_file.unfinished_beside(real) as unfinished:
         revision, objects = _copied(source, unfinished, target, progress)
+        # who could read the old file must be able to read the new one
         if replace and real.exists():
             shutil.copymode(real, unfinished)
+        # content before name: after a power cut the name must not lead to an empty file
         _sync(unfinished)
         if replace:
             _put_in_place(unfinished, real)
@@ -89,6 +91,7 @@ def _copied(
     connection, file = sqlite_file.open_file(source, read_only=True)
     with contextlib.closing(connection), named_errors(str(source)):
         connection.execute(f"PRAGMA cache_size = -{SOURCE_CACHE_KIB}")
+        # a read transaction around count and pages: in WAL mode writers go on beside it
         connection.execute("BEGIN")
         ((revision, objects),) = connection.execute(
             "SELECT (SELECT coalesce(max(revision), 0) FROM change), (SELECT count(*) FROM object)"
@@ -111,6 +114,7 @@ def _copy_pages(source: apsw.Connection, made: apsw.Connection, progress: Progre
     made.execute("PRAGMA synchronous = OFF")  # the file is still private; `_sync` comes later
     with made.backup("main", source, "main") as copying:
         while not copying.done:
+            # in steps, for progress and Ctrl-C; the transaction above keeps them of one moment
             copying.step(STEP_PAGES)
             if progress is not None:
                 done = copying.page_count - copying.remaining
@@ -145,6 +149,7 @@ def _alone(path: Path) -> Iterator[None]:
             flags = apsw.SQLITE_OPEN_MAIN_DB | apsw.SQLITE_OPEN_READWRITE
             file = held.enter_context(sqlite_bytes.opened_bytes(path, flags))
             try:
+                # SQLite's own order of locks: EXCLUSIVE is granted to a holder of SHARED alone
                 file.xLock(apsw.SQLITE_LOCK_SHARED)
                 file.xLock(apsw.SQLITE_LOCK_EXCLUSIVE)
             except apsw.BusyError as error:
@@ -159,8 +164,10 @@ def _put_in_place(unfinished: Path, path: Path) -> None:
 
     After a kill, SQLite would apply the log to the new file.
     """
+    # locked again: somebody may have opened it during the copy
     with _alone(path):
         for suffix in ("-wal", "-shm"):
             Path(f"{path}{suffix}").unlink(missing_ok=True)
         sqlite_bytes.sync_folder(path)
+        # atomic, after the folder's sync: the old log must be gone before the new file is there
         unfinished.replace(path)

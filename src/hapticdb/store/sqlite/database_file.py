@@ -122,6 +122,7 @@ def _check_kind(path: Path) -> None:
     wal = Path(f"{path.resolve()}-wal")
     if wal.exists() and wal.stat().st_size:
         return  # the size in the header may be older than the log: SQLite decides
+    # 1 stands for 65536, which has no room in two bytes
     page = int.from_bytes(header[16:18], "big")
     expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
     if path.stat().st_size < expected:
@@ -137,6 +138,7 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
     """Open an existing environment."""
     _check_kind(path)
     file = OpenedFile(path)
+    # decided before SQLite opens the file, which may create the -shm itself
     is_immutable = read_only and needs_immutable(path)
     with named_errors(str(path)):
         connection = _connect_to_read(path) if read_only else _connect_to_write(path)
@@ -159,10 +161,12 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
         made = apsw.Connection(str(unfinished))
         with named_errors(str(path)), contextlib.closing(made) as new:
             new.execute(f"PRAGMA page_size = {sqlite_bytes.PAGE_BYTES}")
+            # no journal: nobody sees the file before it is whole, and a failure removes it
             new.execute("PRAGMA journal_mode = OFF").fetchall()
             new.execute(SCHEMA.read_text(encoding="utf-8"))
             fill(new)
             new.execute("PRAGMA journal_mode = WAL").fetchall()
+        # after the close: a link to a file with an open log would miss its last pages
         publish(unfinished, path)
 
 
@@ -190,6 +194,7 @@ def check_folder(path: Path) -> None:
 def unfinished_beside(path: Path) -> Iterator[Path]:
     """Path of a temporary file for `path`, removed at the end unless it was moved."""
     _sweep_unfinished(path)
+    # in the same folder: a link cannot cross file systems
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         yield unfinished
@@ -218,6 +223,7 @@ def _sweep_unfinished(path: Path) -> None:
     """Remove the temporary files of killed processes for this path."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.new*"):
         pid = left.name.split(".")[-2]
+        # a live process may be in the middle of its own import
         if pid.isdigit() and not Path(f"/proc/{pid}").exists():
             left.unlink(missing_ok=True)
 

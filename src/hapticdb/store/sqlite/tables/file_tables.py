@@ -119,6 +119,7 @@ class FileTables(Tables):
 
     def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:  # noqa: ARG002
         gone: list[int] = []
+        # one statement a range: one descent of the index each, without a join
         for low, high in zip(ranges.lows.tolist(), ranges.highs.tolist(), strict=True):
             gone += [row[0] for row in self._do(DELETE[self.layout], (low, high, known.id))]
         return np.array(gone, dtype=np.int64)
@@ -164,6 +165,8 @@ class FileTables(Tables):
             key, object_id = row_of(
                 f"SELECT z_val, id FROM {self.layout} ORDER BY z_val, id LIMIT 1"
             )
+            # by row value from the last bound: OFFSET from the first row would read
+            # all rows before each bound again
             step = (
                 f"SELECT z_val, id FROM {self.layout} WHERE (z_val, id) >= (?1, ?2)"
                 " ORDER BY z_val, id LIMIT 1 OFFSET ?3"
@@ -171,6 +174,7 @@ class FileTables(Tables):
             bounds = [key]
             rank = 1
             for i in range(1, resolution + 1):
+                # ceiling in integers: a float would round ranks of large tables
                 target = max(1, -(-i * n_rows // resolution))
                 if target > rank:
                     key, object_id = row_of(step, key, object_id, target - rank)

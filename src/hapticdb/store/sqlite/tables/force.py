@@ -60,6 +60,7 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
         try:
             if not occupancy[voxel >> 6] >> (voxel >> 3 & 7) & 1:
                 return 0
+            # rank by popcount: eight bytes of marks, then only the bytes that are not zero
             before = int.from_bytes(occupancy[:8], "little") & ((1 << (voxel >> 3)) - 1)
             return occupancy[8 + before.bit_count()] >> (voxel & 7) & 1
         except (TypeError, IndexError) as error:
@@ -93,6 +94,7 @@ class _Force:
         """Wrench of all hits: six doubles."""
         if self._frame is None:
             return bytes(48)
+        # in the shell's order: float sums round alike for every plan of the engine
         hits = np.array(sorted(self._hits), dtype=np.int64)
         wrench: NDArray[np.float64] = refining.wrench_of_addresses(
             self._frame.placed,
@@ -128,6 +130,7 @@ class _LastExcluded:
 
     def is_included(self, exclude: Keys, object_id: int) -> bool:
         """Whether an object is not excluded."""
+        # by identity: called for each row, so no comparison of arrays
         if exclude is not self._ids:
             self._ids, self._set = exclude, frozenset(exclude.tolist())
         return object_id not in self._set

@@ -68,6 +68,7 @@ class RangeStatements:
             int(widths.max()) <= self._mask and int(lows[-1]) < self._key_end and int(lows[0]) >= 0
         )
         if is_narrow:
+            # one carray for both ends: otherwise `nth` is called for each range
             packed = apsw.carray((lows << self._width_bits) | widths)
             return NARROW[columns], (packed, self._width_bits, self._mask)
         return WIDE[columns], (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)

@@ -112,7 +112,7 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
         return {
             "points": len(shell),
             "poses": len(poses),
-            "hits": float(found["dense"][:, 6].mean()),
+            "hits": float(found["dense"]["hits"].mean()),
             "cells": residency.writer.n_resident,
             "bitmap_mb": bitmap.nbytes / 1e6,
             "us_per_frame": medians,

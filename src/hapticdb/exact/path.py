@@ -90,9 +90,8 @@ class ToolPath(SampledPath):
         parameters = np.concatenate([[0.0], np.cumsum(motion)])
         if not np.isfinite(parameters[-1]):
             raise UsageError("the path is longer than numbers go: check its unit")
-        again = (
-            list(range(len(parameters))) if len(parameters) > 1 else [0, 0]
-        )  # two poses at least
+        # two poses at least
+        again = [*range(len(parameters))] if len(parameters) > 1 else [0, 0]
         moved = (
             parameters[again],
             centers[again],

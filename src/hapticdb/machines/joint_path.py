@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import FileError, UsageError
 from hapticdb.exact.path import SampledPath, ToolPath
 from hapticdb.exact.sweep import Mover
-from hapticdb.machines.machine import HINGE, Machine, motion_bounds
+from hapticdb.machines.machine import HINGE, Bounds, Machine, motion_bounds
 from hapticdb.poses import as_floats
 from hapticdb.units import UNITS
 
@@ -75,7 +75,7 @@ def _column(path: str, head: str, machine: Machine) -> tuple[int, float]:
     if head not in machine.driven and (match := _NAME.fullmatch(head)):
         name, unit = match[1], match[2]
     if name not in machine.driven:
-        follows = next((one.driver for one in machine.joints if name in one.name == name), "")
+        follows = next((one.driver for one in machine.joints if one.name == name), "")
         why = f"follows {follows!r}, so leave it out" if follows else f"is none of its: {known}"
         raise FileError(f"{path}: joint {name[:60]!r} {why}")
     joint = next(one for one in machine.joints if one.name == name)
@@ -123,28 +123,37 @@ def beyond_limits(machine: Machine, values: Floats) -> Iterable[str]:
             )
 
 
-def joint_path(machine: Machine, values: Floats, pairs: Iterable[tuple[int, int]]) -> SampledPath:
-    """Path over rows, its parameter the greatest motion of any link in the frame of another."""
+def joint_path(
+    machine: Machine, values: Floats, pairs: Iterable[tuple[int, int]]
+) -> tuple[SampledPath, dict[tuple[int, int], Bounds]]:
+    """Path over rows, its parameter the greatest motion of any link in the frame of another.
+
+    Beside it the bounds of each pair: a link in the frame of the first.
+    """
     placed = machine.all_placed(values)
     with np.errstate(over="ignore", invalid="ignore"):
-        speeds = [motion_bounds(machine, values, *pair, placed).speed for pair in pairs]
+        bounds = {pair: motion_bounds(machine, values, *pair, placed) for pair in pairs}
     # the fastest pair of links: a bound for all, so one parameter orders every hit
-    parameters = np.concatenate([[0.0], np.cumsum(np.max(speeds, axis=0))])
+    parameters = np.concatenate(
+        [[0.0], np.cumsum(np.max([one.speed for one in bounds.values()], axis=0))]
+    )
     if not np.isfinite(parameters[-1]):
         raise UsageError("the joint path is longer than numbers go: check its units")
-    return SampledPath(parameters, values)
+    return SampledPath(parameters, values), bounds
 
 
 def mover_of(
-    machine: Machine, path: SampledPath, first: int, last: int,
+    machine: Machine, path: SampledPath, first: int, last: int, bounds: Bounds,
     frame: Callable[[float], Floats] | None, base: Floats,
 ) -> Mover:  # fmt: skip
-    """A link on its path in the frame of another one; base (4, 4) : `world_from_base`."""
+    """A link on its path in the frame of another one, with its bounds there.
+
+    base (4, 4) : `world_from_base`.
+    """
     values, surface = path.poses, machine.surfaces[last]
-    with np.errstate(over="ignore", invalid="ignore"):
-        _, bend, turn = motion_bounds(machine, values, first, last)
     # chord error h^2 / 8 times the second derivative, solved for the number of parts
-    counts = np.maximum(np.sqrt(bend / (8.0 * DEVIATION)), turn / MOST_TURN)
+    with np.errstate(over="ignore", invalid="ignore"):
+        counts = np.maximum(np.sqrt(bounds.bend / (8.0 * DEVIATION)), bounds.turn / MOST_TURN)
     counts = np.maximum(np.ceil(counts), 1.0)
     # negated as above: the sum overflows with the bounds
     if not counts.sum() <= MOST_POSES:

@@ -163,11 +163,11 @@ class Bounds(NamedTuple):
 
 def motion_bounds(
     machine: Machine, values: Floats, first: int, last: int,
-    placed: Mapping[int, Floats] | None = None,
+    placed: Mapping[int, Floats],
 ) -> Bounds:  # fmt: skip
     """Bounds of a link's motion in the frame of another one; values (rows, joints), linear between.
 
-    placed : poses of all links at the values, if they are known.
+    placed : poses of all links at the values.
 
     A place moves by |dq| times its distance from the axis of each joint between (Schwarzer, Saha,
     Latombe 2005). That is at most the sum of the distances from each joint's point to the next one
@@ -176,7 +176,6 @@ def motion_bounds(
     axis of the later one; a later slide has only the former's rate.
     """
     chain, surface = machine.chain(first, last), machine.surfaces[last]
-    placed = placed or machine.all_placed(values)
     frame = placed[last]
     corners = surface.corners @ np.swapaxes(frame[:, :3, :3], 1, 2) + frame[:, None, :3, 3]
     rates = np.abs(np.diff(values, axis=0))

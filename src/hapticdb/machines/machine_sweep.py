@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 
 import numpy as np
@@ -19,7 +20,7 @@ from hapticdb.machines.joint_path import (
     joint_path,
     mover_of,
 )
-from hapticdb.machines.machine import Machine, pairs_of
+from hapticdb.machines.machine import Bounds, Machine, pairs_of
 from hapticdb.machines.reader import read_machine
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
@@ -80,11 +81,10 @@ def sweep_machine(
     shown = machine.all_placed(values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)])
     pairs.sort(key=lambda pair: _gap(machine, pair, shown, np.inf))  # bounds the later ones
     scene = [(0, link) for link in machine.surfaces]  # link 0 is the base: it stands still
-    path = joint_path(machine, values, [*pairs, *scene])
-    movers = [mover_of(machine, path, *link, None, base) for link in scene]
-    found = swept_along(
-        env, path, movers, request, where, exclude, lambda: _link_pairs(machine, path, pairs, base)
-    )
+    path, bounds = joint_path(machine, values, [*pairs, *scene])
+    movers = [mover_of(machine, path, *link, bounds[link], None, base) for link in scene]
+    links = partial(_link_pairs, machine, path, pairs, bounds, base)
+    found = swept_along(env, path, movers, request, where, exclude, links)
     gap = found.gap._replace(at_least=max(found.gap.at_least - DEVIATION, 0.0))
     if found.is_free and gap.place is not None:
         gap = gap._replace(at_most=gap.at_most + DEVIATION)
@@ -123,8 +123,9 @@ def _gap(
 
 
 def _link_pairs(
-    machine: Machine, path: SampledPath, pairs: list[tuple[int, int]], base: Floats
-) -> Iterator[LinkPair]:
+    machine: Machine, path: SampledPath, pairs: list[tuple[int, int]],
+    bounds: Mapping[tuple[int, int], Bounds], base: Floats,
+) -> Iterator[LinkPair]:  # fmt: skip
     for a, b in pairs:
 
         def frame(parameter: float, link: int = a) -> Floats:  # the default binds `a` now
@@ -132,4 +133,4 @@ def _link_pairs(
 
         shape = machine.surfaces[a]
         thing = Object(machine.names[a], machine.file, "", np.eye(4), 0, shape.box)
-        yield LinkPair(mover_of(machine, path, a, b, frame, base), thing, shape)
+        yield LinkPair(mover_of(machine, path, a, b, bounds[a, b], frame, base), thing, shape)

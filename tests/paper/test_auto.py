@@ -83,3 +83,15 @@ def test_a_frame_is_asked_in_the_same_way_whatever_came_before_it(tmp_path: Path
         asked = [[env.touch(*frame).query[:4] for frame in frames] for _ in range(5)]
         assert all(queries == asked[0] for queries in asked)
         assert [query[0] for query in asked[0]] == ["array", "array", "cbgroup", "array"]
+
+
+@pytest.mark.parametrize("change", [{"statemenp": 1.0}, {"rows_per_block": 0.0}])
+def test_costs_of_other_names_or_values_are_damage(
+    tmp_path: Path, change: dict[str, float]
+) -> None:
+    with make_scene(tmp_path / "e.db") as env:
+        env.store.save_costs(machine_name(), ONE_RANGE.figures() | change)
+        with pytest.raises(hapticdb.errors.DamagedError, match="info --calibrate"):
+            env.touch(cloud(env, 9), middle(env), "cbgroup")
+        env.calibrate()
+        assert env.touch(cloud(env, 9), middle(env), "cbgroup").query.ranges

@@ -2,8 +2,11 @@
 
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
+
+from hapticdb.store.base import Store
+from hapticdb.store.parsing import damaged
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,22 @@ class CostModel:
         plain = {name: value for name, value in figures.items() if "." not in name}
         spread = {n: figures[f"{n}.spread"] for n in plain if f"{n}.spread" in figures}
         return cls(**plain, spread=spread)
+
+    @classmethod
+    def stored(cls, store: Store, machine: str) -> "CostModel | None":
+        """Model of the stored figures of a machine; None without any.
+
+        Raises `hapticdb.errors.DamagedError` for figures of other names, or blocks without rows.
+        """
+        figures = store.costs(machine)
+        if not figures:
+            return None
+        names = {name for name in figures if "." not in name}
+        expected = {each.name for each in fields(cls)} - {"spread"}
+        if names != expected or figures["rows_per_block"] <= 0.0:
+            cause = "kept costs of other names or values; 'hapticdb info --calibrate' renews"
+            raise damaged(store.url, cause)
+        return cls.from_figures(figures)
 
 
 def machine_name() -> str:

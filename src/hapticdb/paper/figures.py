@@ -28,8 +28,7 @@ class QueryFigures:
         if not self._quantiles.n_rows:
             return self._quantiles, CostModel.of_equal_parts()
         if self._costs is None:
-            kept = self._store.costs(machine_name())
-            self._costs = CostModel.from_figures(kept) if kept else calibrate(self._store)
+            self._costs = CostModel.stored(self._store, machine_name()) or calibrate(self._store)
         return self._quantiles, self._costs
 
     def analyze(self) -> QuantileVector:

@@ -131,9 +131,8 @@ def costs_at_start(
     measurement, and a row to measure. If not, or if a round trip takes longer than `FAR`, all parts
     cost the same: results are equal, ranges less efficient.
     """
-    kept = store.costs(machine_name())
-    if kept:
-        return CostModel.from_figures(kept)
+    if (stored := CostModel.stored(store, machine_name())) is not None:
+        return stored
     where = store.url if scheme_of(store.url) else Path(store.url).absolute()
     # by revision: another number of rows has other costs
     entry = entry_of("costs", str(where), store.revision(), machine_name())

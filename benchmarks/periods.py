@@ -1,8 +1,8 @@
-"""Lateness and computing time of periods with 1, 16 and 64 slots at 1 kHz, two trees in turns.
+"""Lateness and computing time of periods with several slots, two trees in turns.
 
-    python benchmarks/periods.py --before /tmp/before/src
+    python benchmarks/periods.py --before /tmp/before/src --rate 5000 --slots 1 16
 
-Each turn is a process with one host: its hands press a ball of 300 points on a plate. Printed are
+Each turn is a process with one host: its hands press a ball of points on a plate. Printed are
 the median slot's p50, and the latest slot's p99 and p99.9 in us, medians over the turns, and the
 ratio after / before of each.
 """
@@ -23,8 +23,8 @@ import trimesh
 import hapticdb
 from hapticdb.session.host import SessionHost
 
-SLOTS, TURNS, SECONDS = (1, 16, 64), 5, 4.0
-VOXEL, RADIUS, POINTS = 0.002, 0.012, 300
+TURNS, SECONDS = 5, 4.0
+VOXEL, RADIUS = 0.002, 0.012
 MOVES_PER_SECOND = 30
 NAMES = ("late p50", "late p99", "late p99.9", "took p50", "took p99", "took p99.9")
 
@@ -41,20 +41,20 @@ def plate(file: Path) -> None:
         raise report.error
 
 
-def ball() -> hapticdb.PointShell:
+def ball(n_points: int) -> hapticdb.PointShell:
     """Evenly spread points of a ball."""
-    n = np.arange(POINTS) + 0.5
-    angle, z = np.pi * (1.0 + 5.0**0.5) * n, 1.0 - 2.0 * n / POINTS
+    n = np.arange(n_points) + 0.5
+    angle, z = np.pi * (1.0 + 5.0**0.5) * n, 1.0 - 2.0 * n / n_points
     r = np.sqrt(1.0 - z * z)
     out = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
     return hapticdb.PointShell(RADIUS * out, -out, np.zeros(3))
 
 
-def measured(file: str, n_slots: int) -> list[float]:
+def measured(file: str, n_slots: int, rate: float, n_points: int) -> list[float]:
     """Figures of one turn, us, in the order of NAMES."""
     pose = np.eye(4)
-    with SessionHost(file) as host:
-        sessions = [host.begin(ball(), pose + _up(0.03)) for _ in range(n_slots)]
+    with SessionHost(file, rate=rate) as host:
+        sessions = [host.begin(ball(n_points), pose + _up(0.03)) for _ in range(n_slots)]
         end = time.monotonic() + SECONDS
         while (left := end - time.monotonic()) > 0.0:
             for n, session in enumerate(sessions):
@@ -83,27 +83,32 @@ def main() -> None:
     """Take turns, or be one."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("--before", type=Path, help="src of the other tree; none: this one twice")
-    options.add_argument("--turn", nargs=2, help=argparse.SUPPRESS)
+    options.add_argument("--slots", nargs="+", default=[1, 16, 64], type=int)
+    options.add_argument("--rate", default=1000.0, type=float, help="Hz")
+    options.add_argument("--points", default=300, type=int)
+    options.add_argument("--turn", help=argparse.SUPPRESS)
     given = options.parse_args()
     here = Path(__file__).parents[1] / "src"
     if given.turn:
-        print(json.dumps(measured(given.turn[0], int(given.turn[1]))))
+        print(json.dumps(measured(given.turn, given.slots[0], given.rate, given.points)))
         return
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "plate.db")
         plate(file)
-        for n_slots in SLOTS:
+        for n_slots in given.slots:
             turns: dict[str, list[Any]] = {"before": [], "after": []}
             for _ in range(TURNS):
                 for side, source in (("before", given.before or here), ("after", here)):
-                    line = [sys.executable, __file__, "--turn", str(file), str(n_slots)]
+                    line = [sys.executable, __file__, "--turn", str(file), "--slots", f"{n_slots}"]
+                    line += ["--rate", f"{given.rate}", "--points", f"{given.points}"]
                     variables = os.environ | {"PYTHONPATH": str(source)}
                     done = subprocess.run(
                         line, env=variables, capture_output=True, text=True, timeout=300, check=True
                     )
                     turns[side].append(json.loads(done.stdout.splitlines()[-1]))
             before, after = (np.median(turns[side], axis=0) for side in ("before", "after"))
-            print(f"{n_slots} slots, {TURNS} turns of {SECONDS:g} s, load {os.getloadavg()[0]:.1f}")
+            scene = f"{n_slots} slots at {given.rate:g} Hz, {given.points} points"
+            print(f"{scene}, {TURNS} turns of {SECONDS:g} s, load {os.getloadavg()[0]:.1f}")
             for name, one, two in zip(NAMES, before, after, strict=True):
                 print(f"  {name:<10} {one:9.1f} -> {two:9.1f} us  {two / max(one, 1e-9):6.3f}")
 

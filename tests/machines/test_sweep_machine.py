@@ -179,7 +179,7 @@ def test_a_base_on_its_floor_touches_and_a_sunk_one_overlaps(
 def test_a_joint_beyond_its_limits_is_told(env: Environment, tmp_path: Path) -> None:
     limited = ARM[2].replace("continuous", "revolute").replace("<axis", '<limit upper="1"/><axis')
     found = sweep_machine(env, machine_of(tmp_path, *ARM[:2], limited), [[0.0], [1.2]])
-    assert [note for note in found.notes if "turn is at 1.2 rad in row 1" in note]
+    assert found.notes == ("joint turn is at 1.2 rad in row 1, above 1, its limit",)
 
 
 @pytest.mark.parametrize(
@@ -200,6 +200,11 @@ def test_values_that_are_none_are_refused(
 def test_a_machine_without_joints_is_refused(env: Environment, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no joints"):
         sweep_machine(env, machine_of(tmp_path, ARM[1]), np.zeros((1, 0)))
+
+
+def test_sweep_machine_ends_when_its_time_is_over(env: Environment, tmp_path: Path) -> None:
+    found = sweep_machine(env, machine_of(tmp_path, *EXCAVATOR), [[0.0] * 2], seconds=1e-9)
+    assert (found.verdict, found.gap.at_least) == (PathVerdict.NOT_DECIDED, 0.0)
 
 
 def random_machine(folder: Path, rng: np.random.Generator) -> Machine:

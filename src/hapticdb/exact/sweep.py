@@ -4,7 +4,7 @@ Broad phase: the objects' boxes, never too few of them. Narrow phase: their surf
 """
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -95,13 +95,13 @@ def sweep(
 
 def swept_along(
     env: Environment, path: SampledPath, movers: Sequence["Mover"], request: "SweepRequest",
-    where: Words, exclude: Words, pairs: Callable[[], Iterable["LinkPair"]] = tuple,
+    where: Words, exclude: Words, pairs: Sequence["LinkPair"] = (),
 ) -> Swept:  # fmt: skip
     """Sweep rigid bodies, and pairs of them, along one path."""
     # once more from the start: the new connection has another snapshot
     with suppress(ConnectionLostError):
-        return _Sweep(env, path, movers, request).swept(where, exclude, pairs())
-    return _Sweep(env, path, movers, request).swept(where, exclude, pairs())
+        return _Sweep(env, path, movers, request).swept(where, exclude, pairs)
+    return _Sweep(env, path, movers, request).swept(where, exclude, pairs)
 
 
 class SweepRequest(NamedTuple):
@@ -118,8 +118,10 @@ class SweepRequest(NamedTuple):
     def begun(self, limit: float | None, seconds: float | None) -> "SweepRequest":
         """Check numbers, and begin to count the seconds; UsageError."""
         most = np.inf if limit is None else limit
-        if not (0.0 < self.contact < np.inf and most > 0.0):
-            raise UsageError(f"contact {self.contact} m, limit {limit} m: give lengths above 0")
+        if not 0.0 < self.contact < np.inf:
+            raise UsageError(f"contact {self.contact} m: give a length above 0")
+        if not most > 0.0:
+            raise UsageError(f"limit {limit} m: give a length above 0")
         if not 0.0 <= self.overlap < np.inf:
             raise UsageError(f"overlap {self.overlap} m: give 0 or a length above 0")
         if seconds is not None and not seconds > 0.0:
@@ -182,9 +184,13 @@ class Mover(NamedTuple):
 
 
 class LinkPair(NamedTuple):
-    """Two links of a machine: one in the frame of the other, which stands for an object."""
+    """Two links of a machine: one in the frame of the other, which stands for an object.
 
-    mover: Mover
+    least : lower bound of their gap on the path, metres.
+    """
+
+    least: float
+    mover: Callable[[], Mover]
     object: Object
     shape: CollisionShape
 
@@ -218,7 +224,7 @@ class _Sweep:
         self._undecided: list[Object] = []
         self._error = 0.0  # chord errors where the gap was measured
 
-    def swept(self, where: Words, exclude: Words, pairs: Iterable[LinkPair]) -> Swept:
+    def swept(self, where: Words, exclude: Words, pairs: Sequence[LinkPair]) -> Swept:
         """Sweep, in one snapshot."""
         began, is_stopped = time.monotonic(), False
         with self._env.store.snapshot():
@@ -226,8 +232,10 @@ class _Sweep:
             objects = self._env.select(where, exclude)
             try:
                 # links first: their gaps bound the search among the objects, and read no database
-                for mover, obj, shape in pairs:
-                    self._measure_object(mover, obj, shape, is_inside=True)
+                for least, mover, obj, shape in pairs:
+                    has_hit = bool(self._hits or self._enclosed)
+                    if least < (self._wanted() if has_hit else self._best):
+                        self._measure_object(mover(), obj, shape, is_inside=True)
                 near = self._decide(objects)
                 self._follow()
             except OverTimeError:
@@ -252,6 +260,8 @@ class _Sweep:
 
     def _decide(self, objects: list[Object]) -> int:
         """Decide about objects, the nearest boxes first; returns their number."""
+        if time.monotonic() > self._request.until:
+            raise OverTimeError
         least_gaps, is_inside = self._box_gaps(objects)
         nearest = least_gaps.min(axis=0, initial=np.inf)
         # best first: a small gap soon bounds all others; stable, so results repeat

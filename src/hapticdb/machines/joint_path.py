@@ -117,9 +117,10 @@ def beyond_limits(machine: Machine, values: Floats) -> Iterable[str]:
         row = int(np.argmax(over))
         if over[row] > 1e-9:
             unit = "rad" if joint.kind == HINGE else "m"
+            is_above = own[row] > joint.high
+            limit = f"above {joint.high:.6g}" if is_above else f"below {joint.low:.6g}"
             yield (
-                f"joint {joint.name} is at {own[row]:.6g} {unit} in row {row}, outside its limits "
-                f"{joint.low:.6g} to {joint.high:.6g}"
+                f"joint {joint.name} is at {own[row]:.6g} {unit} in row {row}, {limit}, its limit"
             )
 
 

@@ -1,17 +1,20 @@
 """Sweeps of machines along joint paths: links against objects, and links against links."""
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from os import PathLike
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
+from hapticdb.exact.distance import OverTimeError
 from hapticdb.exact.path import SampledPath, checked_poses
 from hapticdb.exact.separation import CONTACT
-from hapticdb.exact.sweep import LinkPair, SweepRequest, swept_along
+from hapticdb.exact.sweep import LinkPair, Mover, SweepRequest, swept_along
 from hapticdb.exact.swept import Swept
 from hapticdb.machines.joint_path import (
     DEVIATION,
@@ -26,9 +29,12 @@ from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 SAMPLES = 8
 """Rows at which the links' distances are measured: the nearest pair is swept first."""
+STRETCHES = 128
+"""Stretches of a path for the lower bounds of the links' gaps. More: fewer pairs are swept."""
 
 
 def sweep_machine(
@@ -77,13 +83,10 @@ def sweep_machine(
     request = request.begun(limit, seconds)
     base = np.eye(4) if at is None else checked_poses(np.asarray(at)[None])[0]
     values = checked_values(machine, q)
-    pairs, notes = _tested(machine, contact)
-    shown = machine.all_placed(values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)])
-    pairs.sort(key=lambda pair: _gap(machine, pair, shown, np.inf))  # bounds the later ones
-    scene = [(0, link) for link in machine.surfaces]  # link 0 is the base: it stands still
-    path, bounds = joint_path(machine, values, [*pairs, *scene])
-    movers = [mover_of(machine, path, *link, bounds[link], None, base) for link in scene]
-    links = partial(_link_pairs, machine, path, pairs, bounds, base)
+    try:
+        path, movers, links, notes = _prepared(machine, values, base, request)
+    except OverTimeError:  # so the sweep ends at once, undecided
+        path, movers, links, notes = SampledPath(np.zeros(len(values)), values), [], [], []
     found = swept_along(env, path, movers, request, where, exclude, links)
     gap = found.gap._replace(at_least=max(found.gap.at_least - DEVIATION, 0.0))
     if found.is_free and gap.place is not None:
@@ -92,7 +95,33 @@ def sweep_machine(
     return replace(found, gap=gap, notes=remarks)
 
 
-def _tested(machine: Machine, contact: float) -> tuple[list[tuple[int, int]], list[str]]:
+def _prepared(
+    machine: Machine, values: Floats, base: Floats, request: SweepRequest
+) -> tuple[SampledPath, list[Mover], list[LinkPair], list[str]]:
+    """Path, movers for the scene, pairs of links with the nearest ones first, and notes."""
+    pairs, notes = _tested(machine, request)
+    shown = machine.all_placed(values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)])
+    gaps = {pair: _gap(machine, pair, shown, np.inf) for pair in _in_time(pairs, request)}
+    pairs.sort(key=gaps.__getitem__)  # bounds the later ones
+    scene = [(0, link) for link in machine.surfaces]  # link 0 is the base: it stands still
+    path, bounds = joint_path(machine, values, _in_time([*pairs, *scene], request))
+    movers = [
+        mover_of(machine, path, *link, bounds[link], None, base)
+        for link in _in_time(scene, request)
+    ]
+    links = _link_pairs(machine, path, _in_time(pairs, request), bounds, base)
+    return path, movers, list(links), notes
+
+
+def _in_time(pairs: Iterable[T], request: SweepRequest) -> Iterator[T]:
+    """Pass on what is given; OverTimeError once the time is over."""
+    for pair in pairs:
+        if time.monotonic() > request.until:
+            raise OverTimeError
+        yield pair
+
+
+def _tested(machine: Machine, request: SweepRequest) -> tuple[list[tuple[int, int]], list[str]]:
     """Pairs of links that move to one another and are tested, and a note of those left out."""
     pairs = [pair for pair in pairs_of(machine.surfaces) if machine.chain(*pair)]
     if machine.excluded is not None:
@@ -101,7 +130,8 @@ def _tested(machine: Machine, contact: float) -> tuple[list[tuple[int, int]], li
     zero = machine.all_placed(machine.values(np.zeros((1, len(machine.driven)))))
     tested: list[tuple[int, int]] = []
     touching: list[tuple[int, int]] = []
-    for a, b in pairs:
+    contact = request.contact
+    for a, b in _in_time(pairs, request):
         # no list in the file: neighbours in contact at zero are taken for joined, not for clashing
         is_touching = _gap(machine, (a, b), zero, 2.0 * contact) <= contact
         (touching if is_touching else tested).append((a, b))
@@ -123,14 +153,25 @@ def _gap(
 
 
 def _link_pairs(
-    machine: Machine, path: SampledPath, pairs: list[tuple[int, int]],
+    machine: Machine, path: SampledPath, pairs: Iterable[tuple[int, int]],
     bounds: Mapping[tuple[int, int], Bounds], base: Floats,
 ) -> Iterator[LinkPair]:  # fmt: skip
+    rows = len(path.poses) - 1
+    parts = max(STRETCHES // rows, 1)
+    middles = (np.arange(rows * parts) + 0.5) / parts
+    given = np.arange(rows + 1)
+    values = np.stack([np.interp(middles, given, one) for one in path.poses.T], axis=1)
+    placed = machine.all_placed(values)
     for a, b in pairs:
 
         def frame(parameter: float, link: int = a) -> Floats:  # the default binds `a` now
             return np.asarray(base @ machine.placed(path.at([parameter]), link)[0])
 
         shape = machine.surfaces[a]
+        # no place moves farther from the middle of a stretch: boxes there bound the gap
+        reach = np.repeat(bounds[a, b].speed / (2 * parts), parts)
+        poses = np.linalg.inv(placed[a]) @ placed[b]
+        gaps = machine.surfaces[b].box_gaps(shape.box[None], poses, reach)
+        mover = partial(mover_of, machine, path, a, b, bounds[a, b], frame, base)
         thing = Object(machine.names[a], machine.file, "", np.eye(4), 0, shape.box)
-        yield LinkPair(mover_of(machine, path, a, b, bounds[a, b], frame, base), thing, shape)
+        yield LinkPair(float(gaps.min()) - shape.chord, mover, thing, shape)

@@ -28,7 +28,8 @@ def machine_of_mjcf(path: Path) -> Machine:
         raise FileError(f"{path}: {' '.join(str(error).split())}") from None
     finally:
         mujoco.set_mju_user_warning(None)
-    return _Reading(path, model, mujoco).machine()
+    with np.errstate(invalid="ignore"):  # infinite places: `read_machine` refuses them
+        return _Reading(path, model, mujoco).machine()
 
 
 class _Reading:

@@ -172,7 +172,10 @@ def _mesh(
     name = of.get("filename", "")
     file = _beside(path, name)
     if file is None:
-        raise FileError(f"{path}: link {link!r}: its mesh {name[:200]!r} is not beside the file")
+        raise FileError(
+            f"{path}: link {link!r}: its mesh {name[:200]!r} is not beside the file, nor in a "
+            "package above it; absolute paths and other addresses are not read"
+        )
     if file not in meshes:
         parts = [one for one in read_file(file, unit="m").parts if not one.is_cloud]
         if not parts:

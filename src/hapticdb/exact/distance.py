@@ -146,7 +146,9 @@ class Pair:
         middles = self.path.at(0.5 * (edges[:-1] + edges[1:]))
         gaps = self.tool.box_gaps(self._bounds[None], middles, 0.5 * np.diff(edges))[0]
         # run-length: padded with False, so begins and ends alternate
-        ends = np.flatnonzero(np.diff(np.concatenate([[False], gaps < best, [False]])))
+        # a known collision has a distance of 0: boxes that overlap before it are near, too
+        is_near = gaps < max(best, 2.0 * MEETING)
+        ends = np.flatnonzero(np.diff(np.concatenate([[False], is_near, [False]])))
         for first, last in ends.reshape(-1, 2).tolist():
             # whole segments of the path: outward on both sides
             low = int(self.path.segments(edges[first : first + 1])[0])

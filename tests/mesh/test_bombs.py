@@ -2,7 +2,6 @@
 
 import json
 import struct
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,11 @@ import numpy as np
 import pytest
 
 from children import TIMEOUT
-from hapticdb import PointShell
 from hapticdb.errors import FileError, UsageError
 from hapticdb.ingest.files import ImportOptions, import_files
 from hapticdb.mesh import parse_in_process, read_file
 from hapticdb.mesh.formats import accessors
-from hapticdb.mesh.formats import threemf as threemf_module
-from mesh_files import COLLADA, MESH_3MF, TRIANGLE, cause, glb_of, gltf, text, threemf
+from mesh_files import TRIANGLE, cause, glb_of, gltf, text
 
 
 def test_a_glTF_that_lists_itself_is_read_once(  # noqa: N802
@@ -83,80 +80,24 @@ def test_nesting_without_end_is_one_line_from_the_child(tmp_path: Path, suffix: 
     assert "nested too deeply" in cause(path, read_file)
 
 
-def test_names_along_deep_nodes_have_an_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    nodes = [{"name": "n" * 11, "mesh": 0}]
-    monkeypatch.setattr("hapticdb.mesh.parsed.MOST_CHARACTERS", 10)
-    for path in (gltf({"nodes": nodes}, tmp_path / "a.gltf"), text(tmp_path / "a.dae", COLLADA)):
-        assert "nests its nodes too deeply" in cause(path)
-
-
 def _las(tmp_path: Path, **counts: int) -> Path:
     """A LAS 1.4 file of three points in format 0, with the given counts in its header."""
     header = bytearray(375)
     header[:4], header[24], header[25], header[105] = b"LASF", 1, 4, 20
-    given = {"size": 375, "points_at": 375, "records": 0} | counts
-    struct.pack_into("<HII", header, 94, given["size"], given["points_at"], given["records"])
+    given = {"size": 375, "points_at": 375} | counts
+    struct.pack_into("<HI", header, 94, given["size"], given["points_at"])
     struct.pack_into("<I", header, 107, 3)
     struct.pack_into("<3d", header, 131, 0.01, 0.01, 0.01)
-    struct.pack_into("<QIQ", header, 235, 0, counts.get("long_records", 0), 3)
+    struct.pack_into("<Q", header, 247, 3)
     path = tmp_path / "a.las"
     path.write_bytes(bytes(header) + bytes(60))
     return path
 
 
 def test_a_LAS_file_that_promises_more_than_it_holds(tmp_path: Path) -> None:  # noqa: N802
-    """Reading 2^31 records once took 37 s and all memory that the file was allowed."""
     assert len(parse_in_process(_las(tmp_path)).parts[0].vertices) == 3
-    assert "2,147,483,648 records" in cause(_las(tmp_path, records=1 << 31))
-    assert "extended records" in cause(_las(tmp_path, long_records=1 << 31))
     assert "points begin" in cause(_las(tmp_path, points_at=1 << 31))
     assert "points begin" in cause(_las(tmp_path, size=12))
-
-
-def test_a_3MF_file_that_unpacks_to_much_more_is_refused(  # noqa: N802
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(threemf_module, "_UNPACKED", 100_000)
-    resources = f'<object id="1">{MESH_3MF}</object>{" " * 2_000_000}'
-    path = threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>')
-    assert "save it with less compression" in cause(path)
-
-
-def test_a_3MF_file_packed_by_another_method_is_refused(tmp_path: Path) -> None:  # noqa: N802
-    path = tmp_path / "a.3mf"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr("3D/3dmodel.model", "<model/>")
-    assert "deflate" in cause(path)
-
-
-def _shell(path: Path, **changes: Any) -> Path:  # noqa: ANN401 - arrays
-    PointShell.sphere(0.1, 8).save(path)
-    np.savez_compressed(path, **(dict(np.load(path)) | changes))
-    return path
-
-
-def test_a_saved_shell_that_unpacks_to_much_more_is_refused(tmp_path: Path) -> None:
-    """A saved shell of 2.3 MB once took 5.9 GB when it was unpacked."""
-    assert len(PointShell.load(_shell(tmp_path / "a.npz"))) == 8
-    for large in ({"points": np.zeros((200_000, 3))}, {"other": np.zeros(2_000_000)}):
-        with pytest.raises(FileError, match="more than 10 times as many"):
-            PointShell.load(_shell(tmp_path / "b.npz", **large))
-
-
-def test_a_saved_shell_that_promises_more_than_it_holds(tmp_path: Path) -> None:
-    path = _shell(tmp_path / "a.npz")
-    with zipfile.ZipFile(path) as archive:
-        entries = {name: archive.read(name) for name in archive.namelist()}
-    points = entries["points.npy"]
-    assert b"(8, 3), }" in points
-    entries["points.npy"] = points.replace(b"(8, 3), }      ", b"(8000000, 3), }")
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in entries.items():
-            archive.writestr(name, content)
-    with pytest.raises(FileError, match="promises 192,000,000 bytes"):
-        PointShell.load(path)
 
 
 def test_limits_are_options_of_an_import(tmp_path: Path) -> None:
@@ -190,16 +131,3 @@ def test_packed_points_of_every_kind_are_read_in_their_chunks(
     n_points = 110_000  # chunks have 50,000 points
     file = parse_in_process(_laz(tmp_path / "a.laz", point_format, n_points))
     assert len(file.parts[0].vertices) == n_points
-
-
-@pytest.mark.parametrize("layer", [0, 8])
-def test_a_layer_that_is_longer_than_its_chunk_is_refused(tmp_path: Path, layer: int) -> None:
-    """A layer length of 2^28 in a file of 787 bytes once took 244 MiB of memory."""
-    path = _laz(tmp_path / "a.laz", 6, 40)
-    content = bytearray(path.read_bytes())
-    (points_at,) = struct.unpack_from("<I", content, 96)
-    at = points_at + 8 + 30 + 10 + 4 + 4 * layer  # skips table position, first point, count
-    (length,) = struct.unpack_from("<I", content, at)
-    struct.pack_into("<I", content, at, length + (1 << 28))
-    path.write_bytes(content)
-    assert "it is damaged: the layers of the chunk at byte" in cause(path)

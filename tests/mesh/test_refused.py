@@ -5,12 +5,10 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from file_seeds import seeds
 from hapticdb.mesh import SUFFIXES, parse_in_process, read_file
-from hapticdb.mesh.parsed import UnreadableError, walk
 from mesh_files import cause, gltf, text, threemf
 
 
@@ -101,11 +99,3 @@ def test_deep_nodes_cost_no_stack(tmp_path: Path) -> None:
     nodes.append({"mesh": 0, "name": "leaf"})
     file = parse_in_process(gltf({"nodes": nodes}, tmp_path / "deep.gltf"))
     assert file.parts[0].name.count("/") == depth
-
-
-def test_placements_that_multiply_are_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hapticdb.mesh.parsed.MAX_NODES", 1000)
-    eye = np.eye(4)
-    with pytest.raises(UnreadableError, match="1,000"):
-        for _ in walk([(0, eye)], lambda i: [(2 * i + 1, eye), (2 * i + 2, eye)]):
-            pass

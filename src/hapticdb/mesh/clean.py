@@ -37,7 +37,7 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
     shared: list[dict[str, str]] = [{} for _ in checked]
     parts: list[Part] = []
     total = parsed.defects
-    names = _Names()
+    taken: dict[str, int] = {}
     worlds, is_near = _worlds(parsed.placements, [one[0] for one in checked], scale)
     is_flat = _are_flat(worlds)
     for n, placement in enumerate(parsed.placements):
@@ -47,7 +47,7 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
             if faces is not None and is_flat[n]:
                 flattened = _count_degenerate(vertices, faces, worlds[n, :3, :3])
                 defects = replace(defects, degenerate=flattened)
-            name = names.unique(_printable(placement.name))
+            name = _unique(_printable(placement.name), taken)
             known = shared[placement.shape]
             chord = parsed.shapes[placement.shape].chord * scale
             said = {key: _printable(value) for key, value in placement.attributes.items()}
@@ -210,18 +210,11 @@ def _printable(name: str) -> str:
     return "".join(" " if unicodedata.category(c) == "Cc" else c for c in whole).strip() or "part"
 
 
-class _Names:
-    """Unique names in the order of the file: 'wheel', 'wheel #2', 'wheel #3'."""
-
-    def __init__(self) -> None:
-        self._taken: set[str] = set()
-        self._count: dict[str, int] = {}
-
-    def unique(self, name: str) -> str:
-        """Name, with a number from its second use on."""
-        candidate = name
-        while candidate in self._taken:
-            self._count[name] = self._count.get(name, 1) + 1
-            candidate = f"{name} #{self._count[name]}"
-        self._taken.add(candidate)
-        return candidate
+def _unique(name: str, taken: dict[str, int]) -> str:
+    """Name, numbered from its second use on: 'wheel', 'wheel #2'; `taken` : last numbers."""
+    candidate = name
+    while candidate in taken:
+        taken[name] += 1
+        candidate = f"{name} #{taken[name]}"
+    taken[candidate] = 1
+    return candidate

@@ -24,12 +24,6 @@ HIDDEN = "node{s} {are} hidden in it, and {come} in like any other"
 ANIMATED = "node{s} {are} moved by animations, which are not read"
 _MOST_NAMES, _LONGEST_NAME = 3, 60
 """Missing files listed in a note, and the last characters of each name."""
-MAX_NODES = 2_000_000
-"""Most placed nodes in a file: placements of nested assemblies multiply. A larger value lets a
-small file take more memory and time."""
-MOST_CHARACTERS = 50_000_000
-"""Most characters in the names of all placements: names of deeply nested nodes grow as the depth
-squared. A larger value lets a small file take more memory."""
 
 
 class UnreadableError(Exception):
@@ -82,24 +76,6 @@ class Parsed:
     up: str | None = None
     notes: list[str] = field(default_factory=list)
     not_lengths: str | None = None
-
-
-class NameBudget:
-    """Joins node names to part names, up to `MOST_CHARACTERS` in total."""
-
-    def __init__(self) -> None:
-        self._left = MOST_CHARACTERS
-
-    def joined(self, names: Sequence[str]) -> str:
-        """Part name: the node names on its path, joined by '/'; UnreadableError over the budget."""
-        name = "/".join(names)
-        self._left -= len(name)
-        if self._left < 0:
-            raise UnreadableError(
-                f"the names of its parts have more than {MOST_CHARACTERS:,} characters: "
-                "it nests its nodes too deeply"
-            )
-        return name
 
 
 def require(is_read: bool, what: str) -> None:  # noqa: FBT001 - what is asked
@@ -206,13 +182,11 @@ def walk(
     """Depth-first traversal of all placed nodes: path from the root, and world_from_node.
 
     In the order of the file; a node on two paths is yielded twice. The yielded list is reused, so
-    copy it. Iterative: deep nesting takes no stack. UnreadableError for a cycle, or beyond
-    `MAX_NODES`.
+    copy it. Iterative: deep nesting takes no stack. UnreadableError for a cycle.
     """
     path: list[Node] = []
     on_path: set[Node] = set()
     levels = [(iter(roots), np.eye(4))]
-    n_nodes = 0
     while levels:
         step = next(levels[-1][0], None)
         if step is None:
@@ -223,9 +197,6 @@ def walk(
         node, parent_from_node = step
         if node in on_path:
             raise UnreadableError("one of its nodes is its own ancestor")
-        n_nodes += 1
-        if n_nodes > MAX_NODES:
-            raise UnreadableError(f"it places more than {MAX_NODES:,} nodes")
         world_from_node = levels[-1][1] @ parent_from_node
         path.append(node)
         on_path.add(node)

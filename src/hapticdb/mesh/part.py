@@ -39,13 +39,9 @@ class Defects:
     def __bool__(self) -> bool:
         return self != _NONE
 
-    def as_dict(self) -> dict[str, int]:
-        """All counts by name."""
-        return {name: getattr(self, name) for name in _WORDS}
-
     def describe(self) -> str:
         """Format the counts above zero, '12 degenerate, 3 non-finite'; '' without defects."""
-        return ", ".join(f"{n} {_WORDS[name]}" for name, n in self.as_dict().items() if n)
+        return ", ".join(f"{n} {_WORDS[name]}" for name, n in vars(self).items() if n)
 
 
 _NONE = Defects()

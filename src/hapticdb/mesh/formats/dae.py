@@ -20,7 +20,6 @@ from hapticdb.mesh.formats.srgb import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.parsed import (
     ANIMATED,
     HIDDEN,
-    NameBudget,
     Parsed,
     Placement,
     Shape,
@@ -72,7 +71,6 @@ def read(path: Path) -> Parsed:
     shapes: dict[tuple[object, ...], int] = {}
     geometries: list[_Geometry] = []
     placements: list[Placement] = []
-    budget = NameBudget()
     for nodes, world_from_node in walk(document.links(scene), document.links):
         for geometry, palette, bound in document.geometries(nodes[-1]):
             key = (geometry, *(f"{name} {palette[name]}" for name in sorted(palette)))
@@ -80,7 +78,7 @@ def read(path: Path) -> Parsed:
                 shapes[key] = len(geometries)
                 geometries.append((geometry, palette))
             names = [*filter(None, (node.get("name") or node.get("id") for node in nodes))]
-            name = budget.joined(names) or geometry.get("name", geometry.get("id", ""))
+            name = "/".join(names) or geometry.get("name", geometry.get("id", ""))
             # The bind transform places a skin; the transform of its node has no effect.
             world = world_from_node if bound is None else bound
             placements.append(Placement(name, shapes[key], world))

@@ -37,7 +37,6 @@ from hapticdb.mesh.formats.srgb import Colours, joined, mean_of_corners, of_ligh
 from hapticdb.mesh.parsed import (
     ANIMATED,
     HIDDEN,
-    NameBudget,
     Parsed,
     Placement,
     Shape,
@@ -312,7 +311,6 @@ def _placements(
 ) -> tuple[list[Placement], list[Pose], dict[int, NDArray[np.float64]], int]:
     """Placements, poses, node transforms and number of empty nodes of the default scene."""
     nodes, meshes = objects_of(tree, "nodes"), objects_of(tree, "meshes")
-    budget = NameBudget()
     placements: list[Placement] = []
     poses: dict[Pose, int] = {}
     worlds: dict[int, NDArray[np.float64]] = {}
@@ -340,7 +338,7 @@ def _placements(
             world = world_from_node if pose.skin is None else np.eye(4)
             for node_from_part in instances(node, accessors):
                 placed_at = world if node_from_part is None else world @ node_from_part
-                placements.append(Placement(budget.joined(names), shape, placed_at))
+                placements.append(Placement("/".join(names), shape, placed_at))
         elif not node.get("children") and "camera" not in node and "extensions" not in node:
             empty += 1
     return placements, [*poses], worlds, empty

@@ -13,7 +13,7 @@ from ifcopenshell.util.element import get_parent
 
 from hapticdb.mesh.chord import MARGIN, coarser_note, measured
 from hapticdb.mesh.formats.srgb import PLAIN, rgba
-from hapticdb.mesh.parsed import NameBudget, Parsed, Placement, Shape, count_note
+from hapticdb.mesh.parsed import Parsed, Placement, Shape, count_note
 
 _EXCLUDED = {
     "opening": ("IfcFeatureElementSubtraction",),
@@ -71,7 +71,6 @@ def _products(model: ifcopenshell.file, excluded: Counter[str]) -> Iterator[enti
 
 def _named(products: Iterable[entity_instance]) -> Iterator[tuple[int, str, dict[str, str]]]:
     """Id of each product, its name path below the project, and its attributes."""
-    budget = NameBudget()
     parents: dict[int, entity_instance | None] = {}
     for product in products:
         chain = [product]
@@ -83,7 +82,7 @@ def _named(products: Iterable[entity_instance]) -> Iterator[tuple[int, str, dict
             if parent is None or parent in chain or parent.is_a("IfcProject"):
                 break
             chain.append(parent)
-        name = budget.joined([one.Name or one.is_a() for one in reversed(chain)])
+        name = "/".join(one.Name or one.is_a() for one in reversed(chain))
         said = {"IfcClass": product.is_a(), "GlobalId": product.GlobalId or ""}
         storey = next((one for one in chain if one.is_a("IfcBuildingStorey")), None)
         yield product.id(), name, said | ({"Storey": storey.Name or ""} if storey else {})

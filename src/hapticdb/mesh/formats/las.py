@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import laspy
-import lazrs
 import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 from numpy.typing import NDArray
@@ -32,17 +31,7 @@ value accepts more lost positions."""
 _COARSE = 0.3
 """Step between coordinates, metres, from which on it is reported: whole metres, and whole feet."""
 _COLOURS = ("red", "green", "blue")
-_BYTE = 255
 _HEADER = 227
-_HEADER_1_4 = 375
-_RECORD, _LONG_RECORD = 54, 60
-"""Header bytes of a variable-length record, and of an extended one."""
-_VARIABLE = 0xFFFFFFFF
-"""Chunk size in a LAZ header of chunks of variable size."""
-_LAYERED = 3
-_BYTES = 14
-_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-"""Layers of each kind of item of a point; extra bytes have one layer each (LASzip, laszip.hpp)."""
 _POINTS_AT_ONCE = 50_000, 1_000_000
 """Least and greatest number of points of a batch; between them, one for each byte of the file.
 laspy allocates memory for the whole batch before it reads a point."""
@@ -59,8 +48,6 @@ def read(path: Path) -> Parsed:
         if not reader.header.are_points_compressed:
             behind = path.stat().st_size - reader.header.offset_to_point_data
             _refuse_cut(promised, behind // reader.header.point_format.size)
-        _check_chunks(reader.header)
-        _check_layers(path, reader.header)
         lengths = _lengths(reader.header)
         places = _Places(reader.header.scales, lengths.metres)
         least, most = _POINTS_AT_ONCE
@@ -100,7 +87,7 @@ def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:
         return None
     channels = np.concatenate(painted)
     colours = np.full((len(channels), 4), 255, dtype=np.uint8)
-    colours[:, :3] = channels if most <= _BYTE else channels // 257
+    colours[:, :3] = channels if most <= 255 else channels // 257
     return colours
 
 
@@ -202,69 +189,18 @@ def _lengths(header: laspy.LasHeader) -> _Lengths:
     return _Lengths(metres, height / metres, (differ,) if height != metres else (), up=up)
 
 
-def _check_chunks(header: laspy.LasHeader) -> None:
-    """Refuse chunks much larger than the file's points: lazrs allocates whole chunks."""
-    for record in header.vlrs.get("LasZipVlr"):
-        (n_points,) = struct.unpack_from("<I", record.record_data, 12)
-        if n_points != _VARIABLE and n_points > max(_POINTS_AT_ONCE[1], header.point_count):
-            raise UnreadableError(
-                f"it is damaged: its chunks have {n_points:,} points, and it has "
-                f"{header.point_count:,}; unpack it to LAS with another program"
-            )
-
-
-def _check_layers(path: Path, header: laspy.LasHeader) -> None:
-    """Refuse layers longer than their chunk: lazrs allocates the promised length.
-
-    A chunk in layers begins with one unpacked point, the number of points and the length of each
-    layer (LASzip's compressor 3, for point formats from 6 on).
-    """
-    for record in header.vlrs.get("LasZipVlr"):
-        content = record.record_data
-        compressor, n_items = struct.unpack_from("<H", content)[0], len(content[34:]) // 6
-        if compressor != _LAYERED:
-            continue
-        items = [struct.unpack_from("<HHH", content, 34 + 6 * n) for n in range(n_items)]
-        n_point = sum(size for _, size, _ in items)
-        n_layers = sum(size if kind == _BYTES else _LAYERS.get(kind, 0) for kind, size, _ in items)
-        with path.open("rb") as stream:
-            stream.seek(header.offset_to_point_data)
-            at = header.offset_to_point_data + 8
-            for _, n_bytes in lazrs.read_chunk_table(stream, lazrs.LazVlr(content)):
-                stream.seek(at + n_point + 4)
-                lengths = np.frombuffer(stream.read(4 * n_layers), dtype="<u4")
-                if int(lengths.sum(dtype=np.int64)) > n_bytes:
-                    raise UnreadableError(
-                        f"it is damaged: the layers of the chunk at byte {at:,} are longer than "
-                        f"it, {n_bytes:,} bytes"
-                    )
-                at += n_bytes
-
-
 def _check_header(path: Path) -> None:
-    """Refuse counts beyond the file's size: laspy would read records after its end."""
+    """Refuse another or a cut header: laspy would read after the file's end."""
     n_bytes = path.stat().st_size
     with path.open("rb") as stream:
-        header = stream.read(_HEADER_1_4)
+        header = stream.read(_HEADER)
     if header[:4] != b"LASF":
         raise UnreadableError("it is no LAS file: it does not start with 'LASF'")
     if len(header) < _HEADER:
         raise UnreadableError("it is cut short: it ends within its header")
-    size, points_at, n_records = struct.unpack_from("<HII", header, 94)
+    size, points_at = struct.unpack_from("<HI", header, 94)
     if not _HEADER <= size <= points_at <= n_bytes:
         raise UnreadableError(
             f"it is damaged or cut short: its points begin at byte {points_at:,}, its header has "
             f"{size:,} bytes, and the file {n_bytes:,}"
         )
-    if n_records * _RECORD > points_at - size:
-        raise UnreadableError(
-            f"it is damaged: its header promises {n_records:,} records, and "
-            f"{points_at - size:,} bytes stand before the points"
-        )
-    if (header[24], header[25]) >= (1, 4) and len(header) == _HEADER_1_4:
-        start, n_long = struct.unpack_from("<QI", header, 235)
-        if n_long and start + n_long * _LONG_RECORD > n_bytes:
-            raise UnreadableError(
-                f"it is damaged or cut short: its header promises {n_long:,} extended records "
-                f"from byte {start:,} on, and the file has {n_bytes:,}"
-            )

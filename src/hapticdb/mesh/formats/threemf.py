@@ -13,7 +13,6 @@ from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 from xml.parsers import expat
@@ -23,7 +22,6 @@ from numpy.typing import NDArray
 
 from hapticdb.mesh.formats.srgb import PLAIN
 from hapticdb.mesh.parsed import (
-    NameBudget,
     Parsed,
     Placement,
     Shape,
@@ -43,10 +41,6 @@ _METRES = {
     "meter": 1.0,
 }
 _PIECE = 1 << 20
-_UNPACKED, _INFLATION = 32 << 20, 40
-"""Limit of the unpacked size of models: base bytes, plus a multiple of the file's size. Sound
-meshes unpack to five to eight times their size. Larger values let a damaged file take more
-memory."""
 _MOST_KINDS = 3
 """Kinds of elements listed in a note about an extension."""
 _HARMLESS = re.compile("/(material|production|trianglesets)/")
@@ -91,8 +85,6 @@ class _Model:
     colours: list[tuple[int, ...]] = field(default_factory=list)
     number_of: dict[tuple[str, str, str], int] = field(default_factory=dict)
     """Colour indices by model file, group and index in the group."""
-    packed: int = 0
-    unpacked: int = 0
     types: Counter[str] = field(default_factory=Counter)
     """Numbers of objects other than models, by type."""
     unread: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
@@ -121,12 +113,11 @@ def read(path: Path) -> Parsed:
     """Parts of a 3MF file's build, in its unit (millimetres without one)."""
     try:
         with zipfile.ZipFile(path) as archive:
-            model = _read_archive(archive, path.stat().st_size)
+            model = _read_archive(archive)
     except zipfile.BadZipFile:
         raise UnreadableError("it is no 3MF file, or cut short: not a ZIP archive") from None
     shapes: dict[Key, int] = {}
     placements: list[Placement] = []
-    budget = NameBudget()
     for keys, world_from_object in walk(model.items, lambda key: model.objects[key].components):
         thing = model.objects[keys[-1]]
         model.placed.add(keys[-1])
@@ -134,7 +125,7 @@ def read(path: Path) -> Parsed:
             continue
         names = [model.objects[key].name for key in keys]
         number = shapes.setdefault(keys[-1], len(shapes))
-        placements.append(Placement(budget.joined(names), number, world_from_object))
+        placements.append(Placement("/".join(names), number, world_from_object))
     read_shapes = [_shape(model.objects[key], model.colours) for key in shapes]
     return Parsed(read_shapes, placements, model.metres, up="z", notes=model.notes())
 
@@ -164,7 +155,7 @@ def _member(name: str) -> str:
     return posixpath.normpath(unquote(name).replace("\\", "/")).lower().strip("/")
 
 
-def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
+def _read_archive(archive: zipfile.ZipFile) -> _Model:
     """Root model, and the models of its components."""
     members = {_member(name): name for name in archive.namelist()}
     root = _root(archive, members)
@@ -173,7 +164,7 @@ def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
         if not models:
             raise UnreadableError("it is no 3MF file: a ZIP archive without a model in it")
         raise UnreadableError(f"its root model {root} is missing; {models[0]} is in it")
-    model = _Model(packed=n_bytes)
+    model = _Model()
     for settings in _SETTINGS:
         found = _MODIFIER.findall(_beside(archive, members.get(settings)))
         model.types.update(kind.decode() for kind in found)
@@ -243,33 +234,11 @@ def _read_model(
     parser.StartElementHandler = start
     named: dict[str, str] = {}
     parser.StartNamespaceDeclHandler = named.__setitem__
-    # Entities can multiply without bound, and 3MF forbids a DOCTYPE, their only source.
-    parser.StartDoctypeDeclHandler = _refuse_doctype
-    if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise UnreadableError("its model is packed by another method than deflate: save it anew")
-    with archive.open(name) as stream:
-        _parse(parser, stream, model)
-
-
-def _parse(parser: expat.XMLParserType, stream: IO[bytes], model: _Model) -> None:
-    """Parse a model as a stream, without a tree: memory is in proportion to the geometry."""
     try:
-        while piece := stream.read(_PIECE):
-            model.unpacked += len(piece)
-            if model.unpacked > _UNPACKED + _INFLATION * model.packed:
-                raise UnreadableError(
-                    f"its models unpack to more than {_UNPACKED >> 20} MiB and {_INFLATION} "
-                    "times its size: save it with less compression"
-                )
-            parser.Parse(piece)
-        parser.Parse(b"", True)  # noqa: FBT003 - the parser's own
+        with archive.open(name) as stream:
+            parser.ParseFile(stream)
     except expat.ExpatError as error:
         raise UnreadableError(f"its model is damaged or cut short: {error}") from None
-
-
-def _refuse_doctype(*_: object) -> None:
-    """Refuse a model with a document type."""
-    raise UnreadableError("its model has a DOCTYPE, which 3MF forbids")
 
 
 def _metres(unit: str) -> float:

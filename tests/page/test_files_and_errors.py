@@ -14,7 +14,7 @@ from children import until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.swept import Gap
-from hapticdb.page.panels.touch import PART
+from hapticdb.page.panels.touch import HIGHEST, PART
 from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.page.wording import FAULT, error_text
 from made_sweeps import place_at, swept
@@ -114,6 +114,9 @@ def test_a_hand_without_a_spring_has_no_stiffness(scene: Path, *, is_direct: boo
         labels = [widget.get("label") for widget in person.widgets.values()]
         assert ("Stiffness, N/m" in labels) == site.is_coupled == (not is_direct)
         assert (browser._coupling() is None) == is_direct
+        (plot,) = (one for one in person.widgets.values() if "torque" in (one.get("scales") or ()))
+        top = HIGHEST * browser.tool.radius / browser.scale  # of the axis, while nothing is touched
+        until(lambda: (person.look(0.05), plot["scales"]["torque"].get("max") == top)[1])
 
 
 URL = "postgresql://ada:s3cret@db.example:5432/cars?environment=beetle&password=s3cret"

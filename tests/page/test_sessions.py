@@ -71,9 +71,8 @@ class Person(Browser):
         self._excluded_ids, self._keeps_tool, self._over, self._is_closed = [], None, [], False
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
         self._zeroing, self.colour = threading.Lock(), (0, 0, 0)
-
-    def session_ended(self) -> None:
-        self.said.append("session_ended")
+        self.touch, self.parts, self.record = MagicMock(), MagicMock(), MagicMock()
+        self.record.session_ended = lambda: self.said.append("session_ended")
 
     def _share(self) -> None:
         self.said.append("share")

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page import checks, colours
 from hapticdb.page.connection import Visitor
 from hapticdb.page.drawing import HandDrawing, add_tool, put_at
+from hapticdb.page.edits import PersonsEdits
 from hapticdb.page.scene.browser_scene import BrowserScene
 from hapticdb.page.site import Site
 from hapticdb.page.tools import PageTool
@@ -31,19 +32,12 @@ Floats = NDArray[np.float64]
 Event = Any
 """Event of a viser callback."""
 
-HAND_WIDTH = 1.0
-"""Initial width of the hand's workspace, metres, that maps to the scene's diagonal. Larger: more
-force for the same penetration on the screen."""
 CAP = 7.0
 """Force cap of a hand in a browser, N, as of scripted hands; length of the longest arrow."""
 LEAST_SEEN = 1e-4
 """Least displacement drawn, as a share of the scene's diagonal, and of a quaternion's entries."""
-PLUMB_EVERY = 0.1
-"""Period of the plumb line, seconds."""
 LEAST_SHOWN = 0.01
 """Least radius of a view, as a share of the scene's diagonal."""
-HISTORY = 300
-"""Samples of the force plot: ten seconds."""
 
 
 class Browser:
@@ -55,6 +49,11 @@ class Browser:
     `close` frees the browser's number.
     """
 
+    touch: Any
+    parts: Any
+    record: Any
+    """Tabs of `TabbedBrowser`, whose modules import this one."""
+
     def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
         self.site, self.client, self.visitor = site, client, visitor
         self.number = number
@@ -65,13 +64,13 @@ class Browser:
         self.dragged_part: int | None = None
         self.tool: PageTool = site.tools[0]
         self.stiffness = 1000.0
-        self.scale = site.facts.diagonal / HAND_WIDTH
+        self.scale = site.facts.diagonal  # at first a metre of the hand is all of the scene
         self.session: HostedSession | None = None
         self._excluded_ids: list[int] = []
         self.hand = self._start()
         self.has_moved = False
         """Whether the person has moved the hand."""
-        self.history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
+        self.history: deque[tuple[float, float, float]] = deque(maxlen=300)  # ten seconds
         self.works: list[Any] = []
         """Long jobs of the panels, `panels.jobs.PanelJob`."""
         self._begun: float | None = None
@@ -87,21 +86,6 @@ class Browser:
         self.drawing = HandDrawing(client, site.facts.diagonal, middle, CAP)
         self.drawing.gizmo.on_update(self._moved)
 
-    def hand_moved(self) -> None:
-        """Hook: the hand has moved."""
-
-    def tool_changed(self) -> None:
-        """Hook: the tool has changed."""
-
-    def choose(self, ids: Sequence[int]) -> None:
-        """Hook: choose objects."""
-
-    def session_ended(self) -> None:
-        """Hook: the session is over, and so is its recording."""
-
-    def frame_came(self, frame: np.void, wrench: Floats, touched: list[Object], now: float) -> None:
-        """Hook: a frame of the session, its wrench (6,), N and N m, and the touched objects."""
-
     def guarded(self, role: str, act: Callable[[Event], None]) -> Callable[[Event], None]:
         """Wrap a callback with a check of the role; errors are reported to this browser alone."""
 
@@ -115,13 +99,12 @@ class Browser:
                 return
             try:
                 act(event)
-            except HapticDBError as error:
-                self.failed(error)
             except Exception as error:
-                if self.has_gone:  # viser raises for a client without connection
-                    LOG.info("a callback of a browser that has gone failed: %r", error)
-                    return
-                LOG.exception("a callback of the page failed")
+                if not isinstance(error, HapticDBError):
+                    if self.has_gone:  # viser raises for a client without connection
+                        LOG.info("a callback of a browser that has gone failed: %r", error)
+                        return
+                    LOG.exception("a callback of the page failed")
                 self.failed(error)
 
         return call
@@ -138,6 +121,18 @@ class Browser:
                 title, plain_name(text), auto_close_seconds=8.0, color="teal" if is_good else "red"
             )
 
+    def edit(
+        self, job: Callable[[PersonsEdits], str], then: Callable[[], None] = lambda: None
+    ) -> None:
+        """Queue an edit of this person, if the page has editors; its words are shown."""
+
+        def done(said: str) -> None:
+            self.notify("Done", said, is_good=True)
+            then()
+
+        if self.site.edits is not None:
+            self.site.edits.submit(self.client.client_id, job, done, self.failed)
+
     def failed(self, error: Exception) -> None:
         """Show an error without the server's paths and addresses."""
         self.notify("Not done", self.site.error_text(error))
@@ -148,7 +143,7 @@ class Browser:
         def act(event: Event) -> None:
             self.move_hand(checks.row_of(event.target.position, event.target.wxyz))
             if event.phase == "end":
-                self.hand_moved()
+                self.touch.show_hand()
 
         self.guarded("toucher", act)(event)
 
@@ -156,8 +151,7 @@ class Browser:
         """Move the hand to a pose (7,), metres."""
         self.hand, self.has_moved = pose, True
         self.drawing.words.visible = False
-        session = self.session
-        if session is not None and not session.is_over:
+        if (session := self._running) is not None:
             session.move(pose)
 
     def use_tool(self, tool: PageTool, pose: Floats | None = None) -> None:
@@ -167,8 +161,9 @@ class Browser:
             self.hand = self._start() if pose is None else pose
             self.drawing.show_ghost(tool, self.colour, self.hand)
             self.begin_anew(keeps_tool=False)
-            self.tool_changed()
-            self.hand_moved()
+            self.touch.show_tool()
+            self.parts.show_tool()
+            self.touch.show_hand()
 
     def put_back(self) -> None:
         """Put the dragged part back and use the first tool; without a dragged part, do nothing."""
@@ -259,7 +254,7 @@ class Browser:
         session = self.session
         if session is None or not self._give_up(session):
             return None
-        self.session_ended()
+        self.record.session_ended()
         try:
             frame = session.latest()
         except HapticDBError:  # it is over
@@ -301,16 +296,20 @@ class Browser:
 
     def matrix_of_tool(self) -> Floats:
         """Pose (4, 4) of the tool, metres; of the hand without a session."""
-        session = self.session
-        frame = None if session is None or session.is_over else session.latest()
+        session = self._running
+        frame = None if session is None else session.latest()
         row = self.hand if frame is None else np.array(frame["tool"][0])
         return pose_of_row(row[:3], row[3:])
+
+    @property
+    def _running(self) -> HostedSession | None:
+        session = self.session
+        return None if session is None or session.is_over else session
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness of the virtual coupling, N/m."""
         self.stiffness = stiffness
-        session = self.session
-        if session is not None and not session.is_over:
+        if (session := self._running) is not None:
             session.set_coupling(self._coupling())
 
     def _coupling(self) -> Coupling | None:
@@ -347,7 +346,7 @@ class Browser:
             # a lost session is noticed by one tick alone, and begun again once
             if self._give_up(session):
                 self.drawing.rest()
-                self.session_ended()
+                self.record.session_ended()
                 self.notify("Tool lost", "its process ended; it begins again")
                 self.begin_anew()
             return
@@ -372,11 +371,11 @@ class Browser:
         self._begun = now if self._begun is None else self._begun
         force, torque = np.linalg.norm(wrench.reshape(2, 3), axis=1).tolist()
         self.history.append((now - self._begun, force, torque))
-        self.frame_came(one, wrench, touched, now)
+        self.touch.show(one, wrench, touched, now)
 
     def _plumb(self, now: float) -> None:
-        """Draw the plumb line from the hand to the first surface below it."""
-        if now - self._plumbed_at < PLUMB_EVERY:
+        """Draw the plumb line from the hand to the first surface below it, ten times a second."""
+        if now - self._plumbed_at < 0.1:
             return
         self._plumbed_at = now
         hit = self.scene.pick(self.hand[:3], -self.site.facts.up)

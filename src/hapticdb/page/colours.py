@@ -20,8 +20,6 @@ TORQUE: Colour = (126, 87, 194)
 """Arrow of the torque."""
 MARK: Colour = (214, 39, 60)
 """Tool of a sweep at its first collision."""
-GOLDEN = 0.61803398875
-"""Golden ratio: step in hue, as a share of the circle, so that neighbours in number differ most."""
 FAMILIES: tuple[Colour, ...] = (
     (158, 181, 207), (216, 181, 160), (174, 198, 164), (188, 178, 208), (221, 206, 168),
     (160, 194, 191), (211, 175, 187), (184, 190, 198), (200, 187, 165), (168, 181, 203),
@@ -45,7 +43,9 @@ PAIR: tuple[Colour, Colour] = ((235, 104, 20), (36, 99, 160))
 
 
 def _hue(number: int, lightness: float, saturation: float) -> Colour:
-    red, green, blue = colorsys.hls_to_rgb(number * GOLDEN % 1.0, lightness, saturation)
+    # steps of the golden ratio: neighbours in number differ most
+    hue = number * 0.61803398875 % 1.0
+    red, green, blue = colorsys.hls_to_rgb(hue, lightness, saturation)
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
@@ -64,14 +64,9 @@ def of_contacts(points: NDArray[np.float64], touched: list[Object]) -> NDArray[n
     if not touched or not len(points):
         return np.full((len(points), 3), FORCE, dtype=np.uint8)
     ordered = sorted(touched, key=lambda obj: float(np.prod(obj.bounds[1] - obj.bounds[0])))
-    away = np.stack(
-        [
-            np.linalg.norm(
-                np.maximum(np.maximum(obj.bounds[0] - points, points - obj.bounds[1]), 0.0), axis=1
-            )
-            for obj in ordered
-        ]
-    )
+    low, high = np.array([obj.bounds for obj in ordered]).swapaxes(0, 1)[:, :, None]
+    beside = np.maximum(np.maximum(low - points, points - high), 0.0)
+    away = np.linalg.norm(beside, axis=2)
     palette = np.array([of_object(obj.id) for obj in ordered], dtype=np.uint8)
     return np.asarray(palette[away.argmin(axis=0)], dtype=np.uint8)
 

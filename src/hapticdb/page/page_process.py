@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 POLL_EVERY = 0.2
 """Period of the check for the parent's end, seconds."""
-PANEL = 320
-"""Width of the panel, pixels: 29 % of a window of 1,100. Larger: less of the scene."""
 
 
 def work(request: PageRequest, sender: MessageSender) -> None:
@@ -67,7 +65,7 @@ def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
         show_logo=False, show_share_button=False, dark_mode=False, brand_color=(36, 99, 160)
     )
     server.gui.main_panel.dock_right()
-    server.gui.main_panel.set_width(PANEL)
+    server.gui.main_panel.set_width(320)  # pixels: 29 % of a window of 1,100
     server.scene.world_axes.visible = False
 
     def connect(client: "ClientHandle") -> None:
@@ -91,4 +89,4 @@ def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
 
     server.on_client_connect(connect)
     server.on_client_disconnect(disconnect)
-    site.begin()
+    site.clock.start()

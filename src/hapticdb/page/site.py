@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,19 +32,6 @@ TICKS = 30.0
 """Frequency of the clock, Hz. Larger: smoother motion, and more CPU for each browser."""
 WORKERS = 4
 """Threads for sessions: a slow start delays no other browser much."""
-
-
-class _Updated(Protocol):
-    """Interface of a browser to the site; `Browser` itself imports this module."""
-
-    def tick(self, now: float) -> None:
-        """Show new frames; called `TICKS` times a second, with a monotonic time in seconds."""
-
-    def objects_changed(self) -> None:
-        """Show the objects' current state."""
-
-    def close(self) -> None:
-        """End the browser's session and nodes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +81,8 @@ class Site:
     host: AttachedHost
     request: PageRequest
     connection: PageConnection
-    browsers: dict[int, _Updated] = field(default_factory=dict)
+    browsers: dict[int, Any] = field(default_factory=dict)
+    """`TabbedBrowser`, whose module imports this one, by viser's numbers of clients."""
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
@@ -121,18 +109,15 @@ class Site:
             *tools.built_in(facts.diagonal, facts.voxel_size, has_distances=facts.has_distances),
         ]
         set_first_view(self.server, facts.bounds, self.view.up, facts.reach(self.tools[0].radius))
-        self._clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)
+        self.clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)
+        """Updates all browsers, once it is started."""
         self.view.on_edit = self._learn
-
-    def begin(self) -> None:
-        """Start the clock."""
-        self._clock.start()
 
     def close(self) -> None:
         """End all sessions, the clock and all threads."""
         self._is_ending.set()
-        if self._clock.is_alive():
-            self._clock.join(5.0)
+        if self.clock.is_alive():
+            self.clock.join(5.0)
         for client in list(self.browsers):
             self.leave(client)
         self.sweeping.shutdown(cancel_futures=True)
@@ -163,7 +148,7 @@ class Site:
             except Exception:
                 LOG.exception("a browser did not end well")
 
-    def everyone(self, act: Callable[[_Updated], None]) -> None:
+    def everyone(self, act: Callable[[Any], None]) -> None:
         """Call a function for each browser; a failure is logged and does not affect the others."""
         for browser in list(self.browsers.values()):
             try:

@@ -1,10 +1,6 @@
 """Browser with the tabs of the panel."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hapticdb.page import checks
 from hapticdb.page.browser import Browser
@@ -16,7 +12,6 @@ from hapticdb.page.panels.sweeps import SweepPanel
 from hapticdb.page.panels.touch import TouchPanel
 from hapticdb.page.panels.viewing import ViewControls
 from hapticdb.page.site import Site
-from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
     from viser import ClientHandle
@@ -43,34 +38,11 @@ class TabbedBrowser(Browser):
             self.record = RecordPanel(self, gui)
         for modifier in (None, "cmd/ctrl"):
             client.scene.on_click(modifier=modifier)(self.guarded("viewer", self._clicked))
-        self.choose(visitor.shown)
+        self.parts.choose(visitor.shown)
         if len(self.chosen) == 2:
             self.parts.measure()
         if visitor.may("toucher"):
             self.use_tool(self.tool)
-
-    def hand_moved(self) -> None:
-        """Show the hand's position."""
-        self.touch.show_hand()
-
-    def tool_changed(self) -> None:
-        """Show the current tool."""
-        self.touch.show_tool()
-        self.parts.show_tool()
-
-    def choose(self, ids: Sequence[int]) -> None:
-        """Choose objects in the tab Parts."""
-        self.parts.choose(ids)
-
-    def session_ended(self) -> None:
-        """End the recording in its tab."""
-        self.record.session_ended()
-
-    def frame_came(
-        self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float
-    ) -> None:
-        """Show a frame's wrench (6,), N and N m, and the touched objects."""
-        self.touch.show(frame, wrench, touched, now)
 
     def tick(self, now: float) -> None:
         """Show the newest frame, of the session and of a replay."""

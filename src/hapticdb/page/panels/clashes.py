@@ -191,7 +191,7 @@ class ClashPanel:
         least = LEAST_SHOWN * browser.site.facts.diagonal
         radius = max(min(0.75 * float(np.linalg.norm(box[1] - box[0])) for box in boxes), least)
         self._end()
-        browser.choose((one.a, one.b))  # the link of the view opens with this pair
+        browser.parts.choose((one.a, one.b))  # the link of the view opens with this pair
         browser.scene.spotlight(dict(zip((one.a, one.b), colours.PAIR, strict=True)))
         words = one.status if one.is_unmeasured else f"{one.kind} {one.length_text()}"
         self._drawn = add_marks(browser.client.scene, "/clash", places, words, 0.04 * radius)
@@ -209,11 +209,10 @@ class ClashPanel:
         because = checks.text_of(self._because.value, LONGEST_TEXT, "a reason").strip()
         if word == "Accept" and not because:
             raise UsageError("say why the pair is accepted")
-        group, edits, found = self._chosen(), self._browser.site.edits, self._found
+        group, found = self._chosen(), self._found
         reason = because if word == "Accept" else None
 
-        def done(said: str) -> None:
-            self._browser.notify("Done", said, is_good=True)
+        def done() -> None:
             status: Shown = "accepted" if reason else "same"
             pairs = [one._replace(status=status, because=reason) for one in group.pairs]
             now = group._replace(pairs=tuple(pairs))
@@ -221,18 +220,10 @@ class ClashPanel:
             self._fill()
             self._choose(now, 0)
 
-        if edits is not None and found is not None:
-            edits.submit(
-                self._browser.client.client_id,
-                lambda own: own.accept(group, found.known, reason), done, self._browser.failed,
-            )  # fmt: skip
+        if found is not None:
+            self._browser.edit(lambda own: own.accept(group, found.known, reason), done)
 
     def _add_rule(self, _: object) -> None:
         text = checks.text_of(self._rule.value, LONGEST_TEXT, "a rule")
-        within, edits = self._lengths()[0], self._browser.site.edits
-        if edits is not None:
-            edits.submit(
-                self._browser.client.client_id,
-                lambda own: own.add_rule(text, within),
-                lambda said: self._browser.notify("Done", said, is_good=True), self._browser.failed,
-            )  # fmt: skip
+        within = self._lengths()[0]
+        self._browser.edit(lambda own: own.add_rule(text, within))

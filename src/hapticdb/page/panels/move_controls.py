@@ -1,7 +1,6 @@
 """Edits of a part's placement by a gizmo: one transaction at the end of a drag, and undo."""
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -65,13 +64,13 @@ class MoveControls:
                 hint="For everyone: the part is moved in the database when you let go of it.",
             )  # fmt: skip
             self._moves.on_update(browser.guarded("editor", self._switch))
-            self._out = gui.add_button_group(
+            out = gui.add_button_group(
                 "For everyone", ("Take out", "Put back"),
                 hint="Takes the chosen part out of the database, or puts yours back.",
             )  # fmt: skip
-            self._out.on_click(browser.guarded("editor", self._take_out))
-            self._undo = gui.add_button("Undo", color="gray")
-            self._undo.on_click(browser.guarded("editor", self._undo_last))
+            out.on_click(browser.guarded("editor", self._take_out))
+            undo = browser.guarded("editor", lambda _: browser.edit(lambda own: own.undo()))
+            gui.add_button("Undo", color="gray").on_click(undo)
 
     def follow(self) -> None:
         """Put the gizmo on the chosen part, if the box is ticked; a drag under way is dropped."""
@@ -165,7 +164,7 @@ class MoveControls:
             with self._lock:
                 part.n_waiting -= 1
                 self.renew()
-            self._written(short_name(moved.name))
+            browser.notify("Done", short_name(moved.name), is_good=True)
 
         def refused(error: Exception) -> None:
             browser.notify("Not moved", browser.site.error_text(error))
@@ -181,19 +180,7 @@ class MoveControls:
     def _take_out(self, event: "GuiEvent[Any]") -> None:
         word = checks.choice_of(event.target.value, ("Take out", "Put back"), "a step")
         if word == "Put back":
-            self._submit(lambda own: own.put_back())
+            self._browser.edit(lambda own: own.put_back())
         else:
             obj = self._browser.only_chosen()
-            self._submit(lambda own: own.take_out(obj))
-
-    def _undo_last(self, _: object) -> None:
-        self._submit(lambda own: own.undo())
-
-    def _submit(self, job: Callable[[PersonsEdits], str]) -> None:
-        """Queue an edit of this person, and notify of its result."""
-        browser = self._browser
-        if browser.site.edits is not None:
-            browser.site.edits.submit(browser.client.client_id, job, self._written, browser.failed)
-
-    def _written(self, said: str) -> None:
-        self._browser.notify("Done", said, is_good=True)
+            self._browser.edit(lambda own: own.take_out(obj))

@@ -17,8 +17,6 @@ from hapticdb.page.wording import force_text, note_html, rows_html
 from hapticdb.recording.file import Recording
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from viser import GuiApi, GuiEvent
 
 Floats = NDArray[np.float64]
@@ -37,6 +35,11 @@ class Replay(NamedTuple):
     times: Floats
     tools: Floats
     wrenches: Floats
+
+    @property
+    def end(self) -> float:
+        """Time of the last frame, seconds."""
+        return float(self.times[-1])
 
 
 class RecordPanel:
@@ -72,7 +75,8 @@ class RecordPanel:
             return []
         try:
             found = [path for path in folder.iterdir() if path.suffix == SUFFIX and path.is_file()]
-            return [path.name for path in sorted(found, key=_changed, reverse=True)[:MOST_LISTED]]
+            found.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+            return [path.name for path in found[:MOST_LISTED]]
         except OSError:
             return []
 
@@ -120,7 +124,7 @@ class RecordPanel:
         self._replay = Replay(times - times[0], poses, wrenches)
         self._draw(recording)
         put(self._time, 0.0)
-        self._time.max = max(round(float(self._replay.times[-1]), 2), 0.01)
+        self._time.max = max(round(self._replay.end, 2), 0.01)
         self._show_at(0.0)
 
     def _draw(self, recording: Recording) -> None:
@@ -150,19 +154,20 @@ class RecordPanel:
     def _slide(self, event: "GuiEvent[Any]") -> None:
         if event.client is None or self._replay is None:
             return
-        last = float(self._replay.times[-1]) + 0.01
-        at = checks.number_of(event.target.value, 0.0, max(last, self._time.max), "a time")
+        at = checks.number_of(event.target.value, 0.0, self._replay.end + 0.01, "a time")
+        self._pause()
+        self._show_at(at)
+
+    def _pause(self) -> None:
         self._played_from = None
         self._play.label = "Play"
-        self._show_at(at)
 
     def _play_or_pause(self, _: object) -> None:
         if self._played_from is not None:
-            self._played_from = None
-            self._play.label = "Play"
+            self._pause()
             return
         at = float(self._time.value)
-        if self._replay is not None and at >= float(self._replay.times[-1]) - 0.02:
+        if self._replay is not None and at >= self._replay.end - 0.02:
             at = 0.0
         self._played_from = (time.monotonic(), at)
         self._play.label = "Pause"
@@ -172,13 +177,11 @@ class RecordPanel:
         if self._played_from is None or self._replay is None:
             return
         begun, at = self._played_from
-        at += now - begun
-        last = float(self._replay.times[-1])
-        if at >= last:
-            self._played_from = None
-            self._play.label = "Play"
-        put(self._time, round(min(at, last), 2))
-        self._show_at(min(at, last))
+        at = min(at + now - begun, self._replay.end)
+        if at == self._replay.end:
+            self._pause()
+        put(self._time, round(at, 2))
+        self._show_at(at)
 
     def _show_at(self, at: float) -> None:
         replay = self._replay
@@ -194,10 +197,3 @@ class RecordPanel:
         self._said.content = rows_html(
             (("Time", f"{replay.times[n]:.2f} s"), ("Force", force_text(force)))
         )
-
-
-def _changed(path: "Path") -> float:
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return 0.0

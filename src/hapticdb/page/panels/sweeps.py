@@ -1,7 +1,6 @@
 """Tab Sweep: verdict, hits and least distance of a tool or a part along a path."""
 
-import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,18 +34,6 @@ DIRECTIONS = {
 """Directions of a sweep: axis of the world frame and sign; None: towards the hand."""
 
 
-class _SweepAnswer(NamedTuple):
-    """Result of a sweep, and the swept shell."""
-
-    shell: PointShell
-    swept: Swept
-
-    @property
-    def place(self) -> PathPlace | None:
-        """Place of the first hit, or of the least distance without a hit."""
-        return self.swept.hits[0] if self.swept.hits else self.swept.gap.place
-
-
 class SweepPanel:
     """Sweeps of this browser's tool or chosen part, and display of their results."""
 
@@ -66,8 +53,7 @@ class SweepPanel:
         self._length = gui.add_number(
             "Length, m", round(0.25 * diagonal, 3), min=0.0, max=self._farthest, step=0.001
         )
-        self._run = gui.add_button("Run the sweep")
-        self._run.on_click(guard("viewer", self._begin))
+        gui.add_button("Run the sweep").on_click(guard("viewer", self._begin))
         self._work = PanelJob(browser, gui, "a sweep", "parts near the way")
         self._clear = gui.add_button("Clear", color="gray", visible=False)
         self._clear.on_click(guard("viewer", self._clean))
@@ -75,24 +61,35 @@ class SweepPanel:
     def _begin(self, _: object) -> None:
         browser = self._browser
         is_part = checks.choice_of(self._what.value, self._what.options, "what").endswith("part")
-        direction = checks.choice_of(self._direction.value, DIRECTIONS, "a direction")
+        word = checks.choice_of(self._direction.value, DIRECTIONS, "a direction")
         length = checks.number_of(self._length.value, 0.0, self._farthest, "a length")
-        part = None
-        if is_part:
-            part = (
-                browser.dragged_part
-                if browser.dragged_part is not None
-                else browser.only_chosen().id
-            )
-        job = _SweepJob(browser, part, direction, length)
-        self._work.begin(job.run, lambda found: self._show(found, job.name))
+        part = browser.dragged_part if is_part else None
+        if is_part and part is None:
+            part = browser.only_chosen().id
+        site, tool, hand = browser.site, browser.tool, browser.matrix_of_hand()
+        first = browser.matrix_of_tool() if part is None else np.eye(4)
+        is_seated, ids = part is not None, [] if part is None else [part]
+        exclude = {*browser.excluded_ids, *ids}
+        name = tool.name if part is None else short_name(site.objects[part].name)
 
-    def _show(self, found: _SweepAnswer, name: str) -> None:
-        swept = found.swept
+        def run(progress: Progress) -> tuple[PointShell, Swept]:
+            with open_environment(site.url, read_only=True) as env:
+                shell = env.shell(*ids, inset=0.0) if is_seated else tool.shell
+                middle = tools.middle_of(shell) if is_seated else np.zeros(3)
+                poses = _path(first, DIRECTIONS[word], length, hand, middle)
+                present = [i for i in exclude if i in site.objects]
+                return shell, sweep(
+                    env, shell, poses, exclude=present, seated=is_seated, progress=progress
+                )
+
+        self._work.begin(run, lambda found: self._show(*found, name))
+
+    def _show(self, shell: PointShell, swept: Swept, name: str) -> None:
         self._erase()
-        if found.place is not None:
-            self._draw(found, found.place, name)
-        line = verdict_line(swept, found.shell)
+        place = swept.hits[0] if swept.hits else swept.gap.place
+        if place is not None:
+            self._draw(shell, swept, place, name)
+        line = verdict_line(swept, shell)
         hit = "".join(
             f"<div>{swatch(colours.of_object(place.object.id))}"
             f"{escaped(short_name(place.object.name))} · at {percent(place.fraction)}</div>"
@@ -108,12 +105,12 @@ class SweepPanel:
         )
         self._clear.visible = True
 
-    def _draw(self, found: _SweepAnswer, place: PathPlace, name: str) -> None:
+    def _draw(self, shell: PointShell, swept: Swept, place: PathPlace, name: str) -> None:
         """Draw the tool at the first hit or the least distance, and the nearest points there."""
-        scene, swept = self._browser.client.scene, found.swept
-        ghost = tools.from_shell(name, found.shell)
+        scene = self._browser.client.scene
+        ghost = tools.from_shell(name, shell)
         pose = place.pose.copy()
-        pose[:3, 3] += pose[:3, :3] @ tools.middle_of(found.shell)
+        pose[:3, 3] += pose[:3, :3] @ tools.middle_of(shell)
         colour = colours.MARK if swept.hits else self._browser.colour
         node = add_tool(scene, "/swept", ghost, colour, 0.4)
         put_at(node, row_of_pose(pose))
@@ -137,44 +134,15 @@ class SweepPanel:
         self._clear.visible = False
 
 
-class _SweepJob:
-    """Request of a sweep; part : id, None for the tool; direction : a key; length : metres."""
-
-    def __init__(self, browser: Browser, part: int | None, direction: str, length: float) -> None:
-        self._site = browser.site
-        self._part = part
-        self._direction, self._length = DIRECTIONS[direction], length
-        self._tool = browser.tool
-        self._hand = browser.matrix_of_hand()
-        self._from = browser.matrix_of_tool()
-        self._exclude = {*browser.excluded_ids, *(() if part is None else (part,))}
-        obj = None if part is None else browser.site.objects[part]
-        self.name = self._tool.name if obj is None else short_name(obj.name)
-
-    def run(self, progress: Progress) -> _SweepAnswer:
-        """Sweep on a separate connection."""
-        with open_environment(self._site.url, read_only=True) as env:
-            shell = self._tool.shell if self._part is None else env.shell(self._part, inset=0.0)
-            present = [i for i in self._exclude if i in self._site.objects]
-            swept = sweep(
-                env, shell, self._path(shell), exclude=present, seated=self._part is not None,
-                progress=progress,
-            )  # fmt: skip
-        return _SweepAnswer(shell, swept)
-
-    def _path(self, shell: PointShell) -> Floats:
-        """Poses (2, 4, 4) of the tool, or displacements of the part from its placement."""
-        first = self._from if self._part is None else np.eye(4)
-        last = first.copy()
-        if self._direction is not None:
-            axis, sign = self._direction
-            last[axis, 3] += sign * self._length
-        elif self._part is None:
-            last = self._hand
-        else:
-            middle = np.eye(4)
-            middle[:3, 3] = tools.middle_of(shell)
-            last = self._hand @ np.linalg.inv(middle)
-        if math.isclose(float(np.abs(last - first).max()), 0.0, abs_tol=1e-12):
-            raise UsageError("a path of no length: give a length, or move the hand")
-        return np.stack([first, last])
+def _path(
+    first: Floats, direction: tuple[int, float] | None, length: float, hand: Floats, middle: Floats
+) -> Floats:
+    """Poses (2, 4, 4) along a direction, or until the place `middle` (3,) is at the hand (4, 4)."""
+    last = hand.copy() if direction is None else first.copy()
+    if direction is None:
+        last[:3, 3] -= hand[:3, :3] @ middle
+    else:
+        last[direction[0], 3] += direction[1] * length
+    if np.abs(last - first).max() <= 1e-12:
+        raise UsageError("a path of no length: give a length, or move the hand")
+    return np.stack([first, last])

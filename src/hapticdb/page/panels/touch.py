@@ -23,13 +23,14 @@ from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent, GuiUplotHandle
+    from viser.uplot import Scale
 
 SHOWN_EVERY = 0.2
 """Period of numbers and plot, seconds."""
 SECONDS = 10.0
 """Time span of the plot, seconds."""
 HIGHEST = 8.0
-"""Top of the plot, N: above the force cap of 7 N."""
+"""Top of the plot, N: above the force cap of 7 N. That of torques is at the tool's lever."""
 SOFTEST, STIFFEST = 50.0, 3000.0
 """Range of the coupling's stiffness, N/m. Larger: harder surfaces, at the force cap sooner."""
 PART = "(a part)"
@@ -73,12 +74,12 @@ class TouchPanel:
                     hint="Of the spring between hand and tool: force for a metre of the hand.",
                 )  # fmt: skip
                 stiffness.on_update(browser.guarded("toucher", self._stiffen))
+            low, high = (round(browser.scale * share, 4) for share in SCALES)
+            self._scales = low, high
             scale = gui.add_number(
-                "Scale", round(browser.scale, 3), step=0.001,
-                min=round(browser.scale * SCALES[0], 4), max=round(browser.scale * SCALES[1], 3),
+                "Scale", round(browser.scale, 3), min=low, max=high, step=0.001,
                 hint="Metres of the scene for one metre of the hand.",
             )  # fmt: skip
-            self._scales = (browser.scale * SCALES[0] * 0.999, browser.scale * SCALES[1] * 1.001)
             scale.on_update(browser.guarded("toucher", self._rescale))
 
     def _choose_tool(self, event: "GuiEvent[Any]") -> None:
@@ -115,6 +116,7 @@ class TouchPanel:
         if scale != self._browser.scale:
             self._browser.scale = scale
             self._browser.begin_anew()
+            self.show_tool()
 
     @property
     def _is_of_the_list(self) -> bool:
@@ -122,13 +124,14 @@ class TouchPanel:
         return self._browser.tool in self._browser.site.tools
 
     def show_tool(self) -> None:
-        """Select the current tool in the list."""
+        """Select the current tool in the list, and fit the plot to its torques."""
         if not hasattr(self, "_tool"):
             return
         browser = self._browser
         options = self._names if self._is_of_the_list else [*self._names, PART]
         self._tool.options = options
         put(self._tool, browser.tool.name if self._is_of_the_list else PART)
+        self._force.scales = _scales(HIGHEST * browser.tool.radius / browser.scale)
 
     def show_hand(self) -> None:
         """Show the hand's position."""
@@ -176,13 +179,10 @@ class TouchPanel:
         )
         if len(touched) > MOST_SAID:
             names += f"<div>and {len(touched) - MOST_SAID} more</div>"
-        said = ""
-        if trouble:
-            said = f'<div style="color:#c4610a">{escaped(trouble)}</div>'
-        elif not touched:
-            hint = (
-                "" if self._browser.has_moved else f": drag the {escaped(self._browser.tool.name)}"
-            )
+        said = f'<div style="color:#c4610a">{escaped(trouble)}</div>' if trouble else ""
+        if not trouble and not touched:
+            tool = escaped(self._browser.tool.name)
+            hint = "" if self._browser.has_moved else f": drag the {tool}"
             said = f'<span style="opacity:0.6">Touches nothing{hint}</span>'
         big = "font-size:1.5em;font-weight:600;font-variant-numeric:tabular-nums;white-space:nowrap"
         small = "font-size:0.75em;opacity:0.65"
@@ -212,9 +212,18 @@ def _css(colour: colours.Colour) -> str:
     return f"rgb({colour[0]},{colour[1]},{colour[2]})"
 
 
+def _scales(top: float) -> "dict[str, Scale]":
+    """Scales of the plot; top : greatest torque, N m."""
+    return {
+        "x": {"time": False, "min": -SECONDS, "max": 0.0},
+        "y": {"auto": False, "min": 0.0, "max": HIGHEST},
+        "torque": {"auto": False, "min": 0.0, "max": top},
+    }
+
+
 def _plot(gui: "GuiApi", *, is_seen: bool) -> "GuiUplotHandle":
     """Add the plot of force and torque, each on an axis of its own."""
-    from viser.uplot import Axis, Legend, Scale, Series  # noqa: PLC0415 - the extra `view`
+    from viser.uplot import Axis, Legend, Series  # noqa: PLC0415 - the extra `view`
 
     return gui.add_uplot(
         (np.array([-SECONDS, 0.0]), np.zeros(2), np.zeros(2)),
@@ -223,11 +232,7 @@ def _plot(gui: "GuiApi", *, is_seen: bool) -> "GuiUplotHandle":
             Series(label="N m", stroke=_css(colours.TORQUE), width=2, scale="torque"),
         ),
         title="Force, N (left); torque, N m (right)",
-        scales={
-            "x": Scale(time=False, min=-SECONDS, max=0.0),
-            "y": Scale(auto=False, min=0.0, max=HIGHEST),
-            "torque": Scale(auto=True),
-        },
+        scales=_scales(1.0),
         axes=(
             Axis(space=60, size=32), Axis(size=40),
             Axis(size=46, scale="torque", side=1, grid={"show": False}),

@@ -29,6 +29,7 @@ def up_axis(objects: Iterable[Object]) -> int:
     for obj in objects:
         said = obj.attributes.get("up")
         votes["xyz".find(said) if isinstance(said, str) and said in AXES else 2] += obj.voxels
+    # reversed: argmax takes the first of equal counts, and a tie is for z
     return 2 - int(np.argmax(votes[::-1]))
 
 
@@ -68,6 +69,7 @@ def _some(texts: Sequence[str]) -> str:
 def _values_of(obj: Object, attribute: str) -> Iterator[object]:
     """Values of an object's attribute: the elements of a list, too; none without the attribute."""
     value: object = obj.attributes
+    # the whole name first: it may contain dots
     if attribute in obj.attributes:
         value = obj.attributes[attribute]
     else:
@@ -95,6 +97,7 @@ def _test_of(wanted: str) -> Callable[[object], bool]:
     number = _number_of(wanted)
 
     def fits(value: object) -> bool:
+        # True equals 1 in Python, but not in JSON
         if isinstance(value, (int, float)) and not isinstance(value, bool) and number is not None:
             return value == number
         text = _text_of(value)
@@ -106,6 +109,7 @@ def _test_of(wanted: str) -> Callable[[object], bool]:
 def _number_of(text: str) -> float | None:
     """Number written as JSON in a text; None for anything else."""
     try:
+        # JSON's grammar, not Python's, where 1_000 is a number, too
         value = json.loads(text)
     except (ValueError, RecursionError):
         return None

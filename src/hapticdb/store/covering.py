@@ -41,9 +41,11 @@ def box_ranges(
     low = np.clip(low, 0, grid.side - 1)
     high = np.clip(high, 0, grid.side - 1)
     longest = int((high - low).max()) + 1
+    # bits of the finest cubes: about 16 of them along the box, none finer than a brick
     finest = max((longest // BOX_CUBES).bit_length(), 3)
     found = key_ranges.ranges_of_box(low, high, grid.bits, grid.curve_code, min(finest, grid.bits))
     found >>= row_shift(layout)
+    # voxel ranges may meet in one row of bricks: merged, so that no row is read twice
     starts = np.flatnonzero(np.append(True, found[1:, 0] > found[:-1, 1] + 1))
     ends = np.append(starts[1:], len(found)) - 1
     return Ranges(found[starts, 0].copy(), found[ends, 1].copy())

@@ -116,6 +116,7 @@ def engine_of(url: Url) -> Engine:
             raise MissingExtraError(
                 f"{redact(os.fspath(url))} needs psycopg: install it with {pip_line('postgres')}"
             ) from error
+    # imported here: a path loads no driver of a server
     return cast("Engine", import_module(f"hapticdb.store.{folder}.{folder}_store").ENGINE)
 
 

@@ -93,6 +93,7 @@ class Listing:
             return [word]
         pieces = [piece.strip() for piece in word.split(",")]
         if not all(is_id(piece) for piece in pieces):
+            # as a whole first: a name may contain commas
             if found := self._fitting(word):
                 return [obj.id for obj in found]
             if len(pieces) == 1:
@@ -124,6 +125,7 @@ def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:
         try:
             if isinstance(word, bool):
                 raise TypeError  # noqa: TRY301 - to Python a bool is an int, but it is no id
+            # `index` takes NumPy's integers and refuses floats
             checked.extend(_read(word) if isinstance(word, str) else [index(word)])
         except TypeError:
             raise UsageError(
@@ -155,6 +157,7 @@ def _named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
     """Objects matching a name or pattern, by the rules of `find_objects`, in their order."""
     pattern = composed(pattern.rstrip("/") or pattern)
     branches = [_branches(composed(obj.name), is_path="/" in pattern) for obj in objects]
+    # an equal name wins over the pattern: names may contain * or [
     as_it_stands = [obj for obj, some in zip(objects, branches, strict=True) if pattern in some]
     if as_it_stands:
         return as_it_stands

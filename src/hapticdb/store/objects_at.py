@@ -37,7 +37,9 @@ def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> N
         return NO_KEYS
     values = unpack(band.data, band.ends)
     i, j, k = (store.grid.decode(keys) & 7).T
+    # as `row_place`: a row begins one centre before its brick
     place = ((i + 1) * ROW_SIDE + j + 1) * ROW_SIDE + k + 1
+    # rounded as `step_of` rounds what is stored
     step = int(min(within, HALF_WIDTH) / VOXELS_A_STEP + 0.5)
     voxel, row = _rows_of_bricks(rows, bricks[inverse])
     is_near = values[row, place[voxel]] <= step
@@ -51,6 +53,7 @@ def _rows_of_bricks(rows: Rows, bricks: Keys) -> tuple[NDArray[np.int64], NDArra
     first = np.searchsorted(rows.keys, bricks)
     last = np.searchsorted(rows.keys, bricks, side="right")
     brick = np.repeat(np.arange(len(bricks)), last - first)
+    # index of the brick's first row, counted on within the brick
     row = np.arange(len(brick)) - np.repeat(np.cumsum(last - first) - last, last - first)
     return brick, row
 
@@ -60,6 +63,7 @@ def _is_in_voxel(store: Store, rows: Rows, row: NDArray[np.int64], keys: Keys) -
     if store.grid.curve == "z":
         bit = keys & ((1 << BRICK_SHIFT) - 1)
     else:
+        # bits within a brick are in z-order on either curve
         bit = encode(store.grid.decode(keys) & 7, 3, Z_ORDER)
     bytes_of = rows.occupancy[BRICK_BYTES * row + (bit >> 3)]
     return ((bytes_of >> (bit & 7).astype(np.uint8)) & 1).astype(np.bool_)

@@ -72,8 +72,10 @@ class Checksum:
         """Add the next rows: their distances, or without any their bricks."""
         keys, contents = rows.keys, rows.occupancy
         if rows.distances is not None:
+            # with lengths: else a byte could move to the next row without a change of the CRC
             keys = np.stack([keys, rows.distances.lengths], axis=1)
             contents = rows.distances.data
+        # little-endian on every machine: copies compare these sums
         self._keys = zlib.crc32(np.ascontiguousarray(keys, "<i8").data, self._keys)
         if contents.size:
             self._contents = zlib.crc32(np.ascontiguousarray(contents).data, self._contents)
@@ -158,6 +160,7 @@ def grid_of(url: str, rows: Sequence[Sequence[Any]]) -> tuple[Grid, Layout]:
         raise damaged(url, f"no grid of layout {layout!r:.40}")
     if layout == "brick" and curve == "lexicographic":
         raise damaged(url, "bricks in lexicographic order")
+    # `type`, since a bool is an int to isinstance
     if type(bits) is not int or not all(type(a) in {int, float} for a in (size, x, y, z)):
         raise damaged(url, "a grid that is no numbers")
     try:
@@ -266,6 +269,7 @@ def pair_of(url: str, row: Sequence[Any]) -> PairRow:
     """Parse a pair: a, b, kind, at_least, at_most, its place, status, revision, ..., shapes."""
     a, b, kind, at_least, at_most, *place, status, revision, setting, because, shapes = row
     try:
+        # one sum: a NaN or an infinity among the numbers makes it infinite or NaN
         is_sound = math.isfinite(at_least + (at_most or 0.0) + sum(place))
         kind = Kind(kind)
     except (TypeError, ValueError):
@@ -389,6 +393,7 @@ def _json_of(stored: object) -> dict[str, Any] | None:
         return None
     try:
         found = json.loads(stored)
+    # deep nesting exhausts the parser's stack: RecursionError
     except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None

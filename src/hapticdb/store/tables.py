@@ -63,6 +63,7 @@ DROP_SURFACE = """
 DELETE FROM surface
  WHERE digest = %s AND NOT EXISTS (SELECT 1 FROM object WHERE digest = %s)"""
 LAST_REVISION = "(SELECT coalesce(max(revision), 0) FROM change)"
+# a slow scan of an earlier revision never replaces a later histogram
 SAVE_HISTOGRAM = """
 INSERT INTO quantile VALUES (%s, %s, %s, %s) ON CONFLICT (resolution) DO UPDATE
    SET revision = excluded.revision, n_rows = excluded.n_rows, bounds = excluded.bounds
@@ -79,6 +80,7 @@ def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int
     """
     shift = CELL_SHIFT if grid.is_hierarchical else 2 * grid.bits
     cubes = np.unique(row_keys >> (shift - row_shift(layout)))
+    # a step of more than one cell begins a range; -2 lets the first cell begin one
     starts = np.flatnonzero(np.diff(cubes, prepend=-2) > 1)
     ends = np.append(starts[1:], len(cubes))[: len(starts)] - 1
     return np.stack([cubes[starts] << shift, ((cubes[ends] + 1) << shift) - 1], axis=1)
@@ -259,6 +261,7 @@ class Tables(ABC):
         def work() -> int:
             revision = self._next_revision()
             own: int | None = record.id
+            # a given id stays if it is free, as in a copy
             if record.id <= 0 or self._do("SELECT 1 FROM object WHERE id = %s", (own,)):
                 own = self._new_id(revision)
             named = (own, record.name, record.link)
@@ -301,11 +304,13 @@ class Tables(ABC):
         ranges: Ranges | None = None,
     ) -> None:
         """Exchange an object's rows, inside a transaction."""
+        # read under the write lock: no other write comes between this check and the commit
         known = self.object(record.id)
         check_unwritten(record, known, self.url)
         gone = self._take(known, ranges or self._ranges_of(known), rows.keys)
         self._do(UPDATE_OBJECT, (*self._contents(record, rows), revision, record.id))
         self._put(rows, record.id)
+        # after the update, when only other objects can have the former digest
         self._drop_surface(known.digest)
         self._put_surface(record.digest, surface)
         self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
@@ -349,6 +354,7 @@ class Tables(ABC):
             for n, rule in enumerate(rules, start=1):
                 row = (*rule[:3], ",".join(rule.kinds), *rule[4:])
                 try:
+                    # parsed as a later read parses it: no stored rule can then count as damage
                     parsing.rule_of(self.url, row)
                 except DamagedError:
                     raise UsageError(f"rule {n}, {row}: give what parse_rule returns") from None
@@ -410,6 +416,7 @@ class Tables(ABC):
         """Revision, rows and bounds of a new histogram; None for statistics of the server."""
         with self.snapshot():
             revision = self.revision()
+            # in one snapshot: the revision stored with the bounds is theirs
             bounds, n_rows = self._exact(resolution)
         return revision, n_rows, bounds
 

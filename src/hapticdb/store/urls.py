@@ -28,6 +28,7 @@ def redact(url: str) -> str:
     if secret and not PORTS.match(secret["password"]):
         url = secret["user"] + url[secret.end() - 1 :]
     head, mark, query = url.partition("?")
+    # text without = may be a piece of a password: hidden, too
     pairs = [
         f"{key}=***" if SECRET.search(unquote(key)) else f"{key}={value}" if equals else "***"
         for key, equals, value in (pair.partition("=") for pair in query.split("&") if pair)

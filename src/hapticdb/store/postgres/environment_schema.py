@@ -69,6 +69,7 @@ def check(connection: ServerConnection) -> None:
         raise EnvironmentNotFoundError(
             f"no environment {name!r} at {shown}; make one with 'hapticdb import URL FILE'"
         )
+    # from the catalog, which answers without any right on the schema
     found = connection.rows(
         "SELECT has_schema_privilege(n.oid, 'USAGE') AND has_table_privilege(c.oid, 'SELECT'),"
         "       ARRAY(SELECT attname::text FROM pg_attribute WHERE attrelid = c.oid)"
@@ -134,6 +135,7 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
     """Create the partitions, then the schema with all tables and the grid, in one transaction."""
     with connected(url) as connection:
         name = connection.address.environment
+        # early, since partitions are committed before the schema; `work` closes the race
         if connection.address.partitions and _has_schema(connection):
             raise _there_already(connection)
         spread = partitions.create_partitions(connection.address, connect, grid, layout)
@@ -141,6 +143,7 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
         def work() -> None:
             try:
                 connection.execute(sql.SQL("CREATE SCHEMA {}").format(sql.Identifier(name)))
+            # UniqueViolation: another creator's commit of the same schema came in between
             except (errors.DuplicateSchema, errors.UniqueViolation) as error:
                 raise _there_already(connection) from error
             except errors.InsufficientPrivilege as error:
@@ -157,6 +160,7 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
             )
             spread(connection)
 
+        # the schema exists only if its transaction, with all tables, was committed
         connection.write(work, lambda: _has_schema(connection))
 
 

@@ -51,6 +51,7 @@ SELECT DISTINCT srvname::text
 def ends(grid: Grid, layout: Layout, n: int) -> list[int]:
     """First keys (n - 1,) of all but the first of n partitions, on cells if possible."""
     shift = row_shift(layout)
+    # this many bits leave at least one cell for each partition; else ends lie between rows
     within = CELL_BITS if 3 * grid.bits >= CELL_BITS + n.bit_length() else shift
     cells = 1 << max(3 * grid.bits - within, 0)
     if cells < n:
@@ -58,6 +59,7 @@ def ends(grid: Grid, layout: Layout, n: int) -> list[int]:
             f"a grid of {grid.bits} bits has {cells} rows of the table {layout}, too few for {n} "
             "partitions: give fewer partitions, or more bits"
         )
+    # in keys of rows, which on bricks lack the bits of the voxel
     return [(cells * i // n) << (within - shift) for i in range(1, n)]
 
 
@@ -78,6 +80,7 @@ def create_partitions(
     partitions = partition_addresses(address)
     if not partitions:
         return lambda _: None
+    # refuses a grid too small for its partitions before anything is created
     ends(grid, layout, len(partitions))
     made: list[ServerConnection] = []
     try:
@@ -156,6 +159,7 @@ def _join(
             "with 'CREATE EXTENSION postgres_fdw' and 'GRANT USAGE ON FOREIGN DATA WRAPPER "
             "postgres_fdw TO ...'"
         ) from error
+    # one parent of the partitions' views: a single query sums the sizes on all servers
     connection.execute("CREATE TABLE size (bytes bigint, pages bigint)")
     for n, server in enumerate(servers):
         inherits = sql.SQL(

@@ -192,6 +192,7 @@ def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
         return [wire.int8s(exclude)]
     is_excluded = np.zeros(high - low + 1, dtype=np.bool_)
     is_excluded[exclude - low] = True
+    # `get_bit` numbers the bits of a byte from the least significant one
     bits = np.packbits(is_excluded, bitorder="little").tobytes()
     return [wire.int8(low), wire.int8(high), wire.Parameter(wire.BYTEA, bits)]
 

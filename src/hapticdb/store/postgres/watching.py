@@ -58,6 +58,7 @@ class Watch:
         """Begin to notice commits; see `Store.watch`."""
         self._connection.check_outside()
         self._connection.is_prompt = is_prompt
+        # LISTEN before the first query: a commit between the two sends a notification
         self._connection.again(self._listen)
         self._query_revision()
         self._reported = self.revision
@@ -71,6 +72,7 @@ class Watch:
         """
         self._connection.check_outside()
         self.poll(HINTED_S)
+        # against the last report: a poll of `newest` may have seen the commit before this call
         before, self._reported = self._reported, self.revision
         return before != self._reported
 
@@ -79,6 +81,7 @@ class Watch:
 
         pause : shortest time between two hinted round trips, s.
         """
+        # a new connection: notifications sent before its LISTEN never arrive
         if self._connection.again(self._listen):
             self._reported = -1
         else:
@@ -92,6 +95,7 @@ class Watch:
     def _listen(self) -> bool:
         """Receive notifications, or LISTEN on a new connection; returns whether it is new."""
         driver = self._connection.driver
+        # by identity: a reconnect makes another driver, on which nothing listens yet
         if driver is self._listening_on:
             self._connection.receive_notifications()
             return False
@@ -103,6 +107,7 @@ class Watch:
         except psycopg.Error as error:
             if failures.is_lost(error):
                 raise
+            # a standby refuses LISTEN: only polling shows the commits that it replays
             self._is_polling = True
         self._listening_on = driver
         self._due = 0.0  # if the following query fails, the next call repeats it

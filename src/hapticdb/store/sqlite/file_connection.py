@@ -63,6 +63,7 @@ class FileConnection:
     def snapshot(self) -> Iterator[None]:
         """All reads inside see one committed revision. May be nested."""
         if self._depth == 0:
+            # deferred: the revision is that of the first read inside, and no writer waits
             self.fetch("BEGIN")
         self._depth += 1
         try:
@@ -79,18 +80,21 @@ class FileConnection:
         with sqlite_file.named_errors(self.url):
             self.driver.execute("BEGIN IMMEDIATE")
             try:
+                # with the lock: SQLite would write into a replaced file without an error
                 self.file.verify()
                 yield
             except BaseException:
                 sqlite_file.roll_back(self.driver)
                 raise
             self.driver.execute("COMMIT")
+            # again: the path may have changed during the transaction
             self.file.verify(has_committed=True)
 
     def compact(self) -> None:
         """Rewrite the file with full pages, unless it is large, in use, or the disk is full."""
         if self.driver.pragma("page_count") * PAGE_BYTES > MOST_COMPACTED:
             return
+        # else the copy that VACUUM writes would be in memory, as set for all writers
         self.driver.pragma("temp_store", "file")
         with sqlite_file.named_errors(self.url), contextlib.suppress(*NO_ROOM):
             self.driver.execute("VACUUM")

@@ -72,4 +72,5 @@ def _stamp(path: Path) -> Stamp:
         status = path.stat()
     except FileNotFoundError:
         return 0, 0, False
+    # a write goes into the log first, so a new log counts before the file changes
     return status.st_mtime_ns, status.st_size, Path(f"{path}-wal").exists()

@@ -40,6 +40,7 @@ def read_bytes(path: Path, amount: int, offset: int = 0) -> bytes:
     """Bytes of a database file; fewer at its end."""
     with opened_bytes(path) as file:
         try:
+            # clipped: a read beyond the end is an error of SQLite's file object
             there = max(min(amount, file.xFileSize() - offset), 0)
             return file.xRead(there, offset) if there else b""
         except apsw.IOError as error:  # or truncated since its size was read
@@ -61,6 +62,7 @@ def forget_pages(path: Path) -> None:
     status = path.stat()
     descriptor = descriptor_of((status.st_dev, status.st_ino))
     if descriptor is not None:
+        # first: pages that are not yet on disk cannot be dropped
         os.fsync(descriptor)
         os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
 

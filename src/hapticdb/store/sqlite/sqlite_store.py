@@ -41,6 +41,7 @@ from hapticdb.store.sqlite.tables.file_tables import FileTables
 from hapticdb.store.sqlite.tables.ranges import HELD, LISTS, TABLES, RangeStatements
 from hapticdb.store.tables import Form
 
+# CROSS JOIN fixes the order: keys outside, for each a descent of the index
 LOOKUP: dict[Columns, str] = {
     columns: f"""
 SELECT {LISTS[columns]}
@@ -52,6 +53,7 @@ LOOKUP_ONE: dict[Columns, str] = {
     columns: f"SELECT {LISTS[columns]} FROM {table} WHERE z_val = ?1 AND {HELD[columns]}"
     for columns, table in TABLES.items()
 }
+# for `check`: all rows, with or without voxels or distances
 AFTER: dict[Columns, str] = {
     columns: f"""
 SELECT {LISTS[columns].replace(" distances", " coalesce(distances, x'')")} FROM {table}

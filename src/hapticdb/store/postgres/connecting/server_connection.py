@@ -88,6 +88,7 @@ class ServerConnection(Link, Closes):
         self.check_thread()
         if self.is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
+        # a loss noticed earlier: reconnecting now leaves both attempts for the read
         if self.is_lost and not self._depth:
             self._reconnect()
         try:
@@ -137,6 +138,7 @@ class ServerConnection(Link, Closes):
             yield
         finally:
             self._depth -= 1
+            # the transaction of a lost connection has ended with it
             if self._depth == 0 and not self.is_lost:
                 self._end_snapshot()
 
@@ -160,6 +162,7 @@ class ServerConnection(Link, Closes):
                 if not tries_left:
                     raise
             else:
+                # unconfirmed and not found: the commit was not done, so the work is repeated
                 if is_certain or (is_committed is not None and self._finds(is_committed)):
                     return result
         raise ConnectionLostError(
@@ -186,6 +189,7 @@ class ServerConnection(Link, Closes):
         if self.is_loading:  # another loader may be building the index
             limits.append("lock_timeout")
         with failures.named_errors(self.shown), self.without_time_limit():
+            # from here `again` may not reconnect: the statements before would be missing
             self._depth += 1
             try:
                 self.begin(*(f"{limit} = 0" for limit in limits))
@@ -196,6 +200,8 @@ class ServerConnection(Link, Closes):
             finally:
                 self._depth -= 1
             try:
+                # outside the block above: a commit without an answer may be done, so it is not
+                # rolled back; `write` looks it up on a new connection
                 self.command("COMMIT")
             except SilentServerError:  # it may still be done when the server goes on
                 return result, False

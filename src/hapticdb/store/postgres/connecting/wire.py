@@ -57,6 +57,7 @@ def _array(values: NDArray[Any], oid: int, of: int, kind: np.dtype[np.void]) -> 
     packed = np.empty(len(values), kind)
     packed["length"] = 8
     packed["value"] = values
+    # one dimension, no NULLs, lower bound 1
     return Parameter(oid, struct.pack(">iiiii", 1, 0, of, len(values), 1) + packed.tobytes())
 
 
@@ -83,6 +84,7 @@ def read_int8s(value: bytes | None) -> NDArray[np.int64]:
     if value is None or len(value) < HEADER_BYTES:
         return np.empty(0, np.int64)
     count = (len(value) - HEADER_BYTES) // _STRIDE
+    # a strided view of the values alone, over the length before each
     return np.ndarray((count,), ">i8", value, HEADER_BYTES + 4, (_STRIDE,)).astype(np.int64)
 
 
@@ -102,6 +104,7 @@ def copy_rows(rows: Rows, object_id: int) -> bytes:
     packed["id"] = object_id
     if not rows.occupancy.size:
         return packed.tobytes()
+    # fields of bricks vary in length: they follow the fixed part row by row
     pieces: list[bytes] = []
     for row, fields in zip(packed, fields_of(rows), strict=True):
         pieces.append(row.tobytes())

@@ -144,6 +144,7 @@ class ServerTables(Tables):
 
         On partitions the id of a failed add is never reused: its orphan rows may exist.
         """
+        # of the changes since the last call alone, not of the whole log
         since, highest = self._highest_id
         found = self._do(HIGHEST_ID, (since,))
         self._highest_id = revision - 1, max(highest, int(found[0][0]))
@@ -164,6 +165,7 @@ class ServerTables(Tables):
             " RETURNING xmin::text, pg_notify(%s, revision::text)",
             (*change, channel_of(self._connection.address.environment)),
         )
+        # with the transaction's id: another writer may commit the same revision
         self._written = (*change[:3], transaction)
 
     def _is_written(self) -> bool:
@@ -191,6 +193,7 @@ class ServerTables(Tables):
         """
         lows, highs = ranges
         if self._is_partitioned and keys.size:
+            # one range over all new keys: an orphan row at a new key would collide with its insert
             lows, highs = np.append(lows, keys.min()), np.append(highs, keys.max())
         chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(known.id)
         (found,) = self._connection.fetch(statements.DELETE_ROWS[self.layout], *chosen)
@@ -233,6 +236,7 @@ class ServerTables(Tables):
             return None
         bounds, common = map(wire.read_int8s, found)
         shares = wire.read_float8s(frequencies) if frequencies else np.empty(0)
+        # cumulative shares: R equal buckets at their upper bounds, merged with the common keys
         keys = np.concatenate([bounds[1:], common])
         equal: Keys = np.zeros(SERVER_RESOLUTION + 1, dtype=np.int64)
         if len(keys):
@@ -242,6 +246,7 @@ class ServerTables(Tables):
             up_to = np.cumsum(np.concatenate([in_buckets, shares])[order])
             targets = np.arange(SERVER_RESOLUTION + 1) / SERVER_RESOLUTION * up_to[-1]
             equal = keys[order][np.searchsorted(up_to, targets)]
+            # the least key of all, since a bucket counts at its upper bound
             equal[0] = np.append(keys, bounds[:1]).min()
         return Histogram(equal, rows, "server statistics")
 
@@ -263,6 +268,7 @@ class ServerTables(Tables):
             n_rows = int(counted[0]) if counted else 0
             if n_rows == 0:
                 return np.zeros(2, dtype=np.int64), 0
+            # ceiling in integers: a float would round ranks of large tables
             ranks = -(-np.arange(resolution + 1, dtype=np.int64) * n_rows // resolution)
             (bounds,) = connection.fetch(
                 EXACT[self.layout], wire.int8s(np.maximum(ranks, 1)), wire.float8(float(n_rows))

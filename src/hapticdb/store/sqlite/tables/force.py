@@ -118,6 +118,7 @@ def _without_excluded(
         return sql, bindings
     test = TEST[layout]
     included = f"{test} AND is_included(?{len(bindings) + 1}, id)"
+    # at the row's own condition, which is inside EXISTS in one of the statements
     return sql.replace(test, included), (*bindings, apsw.pyobject(frame.exclude))
 
 

@@ -64,6 +64,7 @@ class RangeStatements:
 
     def _source(self, columns: Columns, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
         widths = highs - lows
+        # ascending, so the first and the last bound all; keys outside the grid have no room
         is_narrow = (
             int(widths.max()) <= self._mask and int(lows[-1]) < self._key_end and int(lows[0]) >= 0
         )

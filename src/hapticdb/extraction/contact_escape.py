@@ -73,6 +73,7 @@ class Twist(NamedTuple):
         speed = float(np.linalg.norm(self.turn))
         # a unit of motion is about a metre: one number bounds shift and turn
         amount = min(farthest, widest / speed) if speed > 0.0 else farthest
+        # turns in steps of `ARC`, since between two poses the centre moves straight
         angles = np.linspace(0.0, amount * speed, 1 + max(int(np.ceil(amount * speed / ARC)), 1))
         found = np.tile(np.eye(4), (len(angles), 1, 1))
         if speed > 0.0:
@@ -209,6 +210,7 @@ def unscrewed(problem: Problem, leaving: Exit, pitch: float, until: float) -> Re
     axes = distinct(np.concatenate([problem.own_axes, -problem.own_axes, AXES]))
     for direction, exit_distance in zip(axes, leaving.distances(axes).tolist(), strict=True):
         heights = problem.corners @ direction
+        # height of the nearest objects' and the part's top over the part's bottom
         past = (
             max((one @ direction).max() for one in [*near_corners, problem.corners]) - heights.min()
         )

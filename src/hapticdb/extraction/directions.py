@@ -36,6 +36,7 @@ def candidate_directions(normals: Floats, own: Floats, seed: int) -> Floats:
     """Likely and random unit directions (D, 3), in the order of the share of opposing contacts."""
     random = np.random.default_rng(seed).normal(size=(N_RANDOM, 3))
     found = distinct(np.concatenate([likely_directions(normals, own), random]))
+    # rounded, and a stable sort: of nearly equal shares the likely directions stay first
     return found[np.argsort(np.round(opposed_shares(found, normals), 2), kind="stable")]
 
 
@@ -43,6 +44,7 @@ def grouped(normals: Floats) -> Floats:
     """Mean unit normals (G, 3) of the largest groups of similar normals, largest group first."""
     if not len(normals):
         return np.empty((0, 3))
+    # rounded to half units, similar normals share a cell
     cells, which, counts = np.unique(
         np.rint(2.0 * normals), axis=0, return_inverse=True, return_counts=True
     )
@@ -57,6 +59,7 @@ def distinct(directions: Floats) -> Floats:
     lengths = np.linalg.norm(directions, axis=1)
     units = directions[lengths > 1e-6] / lengths[lengths > 1e-6, None]
     kept: list[Floats] = []
+    # the first of similar ones stays: exact axes come before means of contact normals
     for unit in units:
         if all(float(unit @ other) < ALIKE for other in kept):
             kept.append(unit)

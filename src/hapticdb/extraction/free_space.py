@@ -99,6 +99,7 @@ class FreeSpace(Closes):
     def __init__(self, problem: Problem, budget_bytes: int) -> None:
         self._problem = problem
         self.start = self.touch(np.eye(4))
+        # an error before `pop_all` closes what is open so far
         with ExitStack() as stack:
             table = stack.enter_context(CellTable.create(budget_bytes))
             residency = Residency(problem.env.store, table, problem.exclude, where=problem.where)

@@ -74,6 +74,7 @@ class GoalsOutside:
         random = rng.normal(size=(N_RANDOM, 3))
         directions = np.concatenate([AXES, random / np.linalg.norm(random, axis=1)[:, None]])
         aside = rng.uniform(-1.0, 1.0, size=(len(directions), 3)) * self._problem.radius
+        # along the axes the part leaves centred, in random directions up to a radius aside
         aside[: len(AXES)] = 0.0
         found: list[Floats] = []
         for turn in turns:
@@ -105,6 +106,7 @@ class GoalsOutside:
             if distance >= length or not self._leaving.is_out(self._problem.shift(out)[None])[0]:
                 continue  # the hull extends as far as all objects
             if room.is_motion_free(np.stack([place, out])):
+                # pushed back in until a hit: the last free pose is the goal
                 deepest = place.copy()
                 deepest[:3, 3] -= distance * direction
                 goal = room.farthest(np.stack([place, deepest]))
@@ -115,6 +117,7 @@ class GoalsOutside:
     def _outside(self, corners: Floats, direction: Floats, across: Floats, turn: Floats) -> Floats:
         """Displacement (4, 4) of the part beyond the hull in a direction."""
         problem = self._problem
+        # the direction is turned into the part's frame, instead of all points out of it
         placed = (problem.shell.points - problem.center) @ (turn.T @ direction)
         reach = float((corners @ direction).max()) + ROOM * problem.voxel_size - float(placed.min())
         distance = max(reach - float(problem.center @ direction), 0.0)
@@ -130,6 +133,7 @@ class GoalsOutside:
         """Corners (n, 3) of the clipped AABBs of the objects that stop most pulls."""
         problem = self._problem
         counts = Counter(i for pull in self._pulls.done for i in pull.blockers)
+        # equal counts by id: the same seed gives the same goals
         ids = [i for i, _ in sorted(counts.items(), key=lambda one: (-one[1], one[0]))]
         first = set(ids[:MOST_BLOCKERS])
         reach = AROUND * problem.radius
@@ -138,6 +142,7 @@ class GoalsOutside:
             for obj in problem.standing
             if obj.id in first
         ]
+        # a box without extent: the hull has corners even if no object stops a pull
         boxes.append(np.stack([problem.center, problem.center]))
         return corners_of(np.stack(boxes)).reshape(-1, 3)
 
@@ -153,6 +158,7 @@ class GoalPose:
 
     def poses(self, room: Room, turns: Floats, *, is_turning: bool) -> Floats:
         """The pose, or poses before it; none if its rotation is not the first one of (k, 3, 3)."""
+        # shifts alone cannot reach another rotation
         if not is_turning and not np.allclose(self._goal[:3, :3], turns[0], atol=SAME):
             return np.empty((0, 4, 4))
         if room.are_free(self._goal[None])[0]:

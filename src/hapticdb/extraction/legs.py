@@ -51,6 +51,7 @@ class Legs(NamedTuple):
         first = sorted(starts, key=lambda one: not _is_along_axis(one))[:MOST_STARTS]
         tried: set[bytes] = set()
         for start, poses, axis in self._tries(first):
+            # by bits: the same stop and axis may come up again
             motion = poses[-1].tobytes() + axis.tobytes()
             if motion in tried:
                 continue
@@ -74,6 +75,7 @@ class Legs(NamedTuple):
                     for axis in AXES:
                         for last in self._along(stop, axis, n_stops):
                             longer = np.concatenate([path, last[None]])
+                            # across the first leg: a second one along it adds nothing
                             for out in AXES[np.abs(AXES @ axis) < 0.5]:
                                 yield start, longer, out
 
@@ -97,6 +99,7 @@ class Legs(NamedTuple):
 
     def _stops(self, begin: Floats, end: Floats, n_stops: int) -> Floats:
         """Free stops (n, 4, 4) on the last leg to a start, its end included."""
+        # a motion with a turn has no straight leg to stop on
         if not np.array_equal(begin[:3, :3], end[:3, :3]):
             return end[None]
         stops = _between(begin, end, n_stops)

@@ -75,6 +75,7 @@ class _Search:
             self._space = base.RealVectorStateSpace(3)
         self._space.setBounds(bounds)
         self._info = base.SpaceInformation(self._space)
+        # a state is a motion without length: one kind of query for both
         self._info.setStateValidityChecker(lambda state: self._is_free(state, state))
         self._info.setMotionValidator(self._motion_validator())
         self._info.setup()

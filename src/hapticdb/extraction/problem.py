@@ -83,6 +83,7 @@ def problem_of(
     a part is a point cloud, or nothing else stands.
     """
     parts = env.find(*words)
+    # parts move as one body, so none of them blocks another
     excluded: tuple[int | str, ...] = (*(obj.id for obj in parts), *exclude)
     standing = env.select(where, excluded)
     if not standing:
@@ -132,10 +133,12 @@ class Exit(NamedTuple):
 
     def distances(self, directions: Floats) -> Floats:
         """Metres (D,) along each unit direction (D, 3) until the part is out."""
+        # axes across the direction divide by 0: replaced by inf below
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             up = (self.high + self.radius - self.center) / directions
             down = (self.low - self.radius - self.center) / directions
         distances = np.where(directions > 0.0, up, np.where(directions < 0.0, down, np.inf))
+        # beyond one side of the box is out, so the nearest side decides
         distances = np.maximum(distances.min(axis=1), 0.0)
         return np.asarray(distances if self.out is None else np.minimum(distances, self.out))
 
@@ -143,6 +146,7 @@ class Exit(NamedTuple):
         """Whether the part is out after shifts (n, 3) of its centre, metres."""
         middles = self.center + shifts
         gaps = np.maximum(np.maximum(self.low - middles, middles - self.high), 0.0)
+        # less rounding: a shift by exactly `distances` is out
         is_clear = gaps.max(axis=1) >= (1.0 - 1e-9) * self.radius
         if self.out is None:
             return np.asarray(is_clear)

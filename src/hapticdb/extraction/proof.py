@@ -44,6 +44,7 @@ class Passed(NamedTuple):
 
     def until(self, n: int) -> Floats:
         """Poses (K, 4, 4) of the motion up to the n-th of `poses`."""
+        # the given corners before the sample, so that no bend is cut short
         return np.concatenate([self.given[self.at < self.parameters[n]], self.poses[n : n + 1]])
 
 
@@ -53,6 +54,7 @@ def passed(problem: Problem, room: Room, poses: Floats, until: float) -> Passed:
     path = proved.swept.path
     parameters = room.parameters(path)
     if not proved.swept.is_free:
+        # short of the hit, where the part already touches
         parameters = parameters[
             parameters <= proved.free_share * path.length - BACK * problem.voxel_size
         ]

@@ -101,6 +101,7 @@ class Pulls:
         Axes come first, then directions with few opposing contacts, shorter pulls first.
         """
         likely = np.flatnonzero(self._is_likely)
+        # the last key of lexsort counts first
         order = np.lexsort(
             (self._lengths[likely], np.round(self._opposed[likely], 2), ~self._is_axis[likely])
         )
@@ -163,6 +164,7 @@ class Pulls:
     def _opposing(self, direction: Floats) -> tuple[int, ...]:
         """Ids of the objects with contacts at the start opposed to a direction."""
         start = self._space.start
+        # contact_pairs has the points' indices first: those of opposing contacts choose the objects
         against = start.contacts[start.contact_normals @ direction < AGAINST]
         pairs = start.contact_pairs[np.isin(start.contact_pairs[:, 0], against)]
         return tuple(np.unique(pairs[:, 1]).tolist())

@@ -166,11 +166,12 @@ def _searched(problem: Problem, request: _Request, progress: Progress | None) ->
     n_motions, is_planned = 0, False
     path = None if request.to is None else prove(problem, np.stack([np.eye(4), request.to]), "pull")
     refuting = () if path is None else path.obstacles
-    path = None if refuting else path
+    path = None if refuting else path  # refuted, it only names what is in the way
     with FreeSpace(problem, request.budget_bytes) as space:
         pulls = Pulls(problem, space, leaving, request.seed)
         if path is None or path.verdict is PathVerdict.NOT_DECIDED:
             pulled = pulls.sweep(problem.until - (1.0 - SHARE_OF_LIKELY) * request.seconds)
+            # for a pose, pulls give only starts of the planner and objects in the way
             if pulled is None or request.to is not None:
                 pulls.run(until, progress)
                 pulled = _best_pull(problem, pulls)
@@ -250,6 +251,7 @@ def _planned(
         if poses is None:
             return path
         planned = prove(problem, poses, "plan")
+        # without obstacles it may be undecided: then it counts only if there is no other path
         if not planned.obstacles:
             return planned if planned.swept.is_free or path is None else path
         if not planner.can_reject:
@@ -279,4 +281,5 @@ def _blockers(pulls: Pulls, *refuting: Object) -> list[tuple[int, int]]:
     """
     counts = Counter(i for pull in pulls.done if not pull.is_out for i in pull.blockers)
     counts.update(obj.id for obj in refuting)
+    # equal numbers by id: the same seed gives the same result
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))

@@ -86,6 +86,7 @@ def serve_attached(
         return call(word, number, *content)
 
     try:
+        # first the descriptor of the shared memory, to which the other process maps its slots
         channel.send(None, [shared.descriptor])
         while True:
             channel.reply(do)
@@ -94,6 +95,7 @@ def serve_attached(
     finally:
         channel.close()
         for number in begun:
+            # one session that fails to end keeps none of the others
             try:
                 call("end", number)
             except Exception:

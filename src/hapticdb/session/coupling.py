@@ -139,8 +139,10 @@ class Coupling:
         """Coupling of one session, as of `of_session`."""
         profile = self.profile or profile
         allowed = limit_stiffness(profile, rate, self.stiffness, self.delay)
+        # lever of the tool at the device: the stiffness of turns is the device's at every scale
         stiffness, lever = allowed.stiffness, radius / scale
         cap = profile.cap if self.cap is None else self.cap
+        # K (T / 2 + t_d): energy from sampling and delay at this stiffness
         damping = stiffness * (0.5 / rate + allowed.delay)
         return SettledCoupling(
             profile=profile.name,

@@ -48,6 +48,7 @@ class HostedSession:
     @property
     def is_over(self) -> bool:
         """Whether the session has ended: by `end`, or because its process died."""
+        # by id, too: the slot may belong to a later session by now
         slots = self._shared.slots
         return bool(slots["id"][self.slot] != self.id or slots["state"][self.slot] != TAKEN)
 

@@ -193,6 +193,7 @@ class _Again:
             slot.reading.buttons[()] = frame["buttons"]
             if version:  # the cells seem to have changed where they did in the session
                 version[()] = -1 if is_anew[n] else published.item()
+            # the recorded duration of the period, not that of a clock
             self._clock.step(dt[n], 0)
             if unknown[n]:
                 unknowns = self._state.missed

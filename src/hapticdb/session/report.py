@@ -32,6 +32,7 @@ def spread_of(counts: NDArray[np.int64], worst: float) -> Spread:
     if not total:
         return Spread(0.0, 0.0, 0.0, 0.0)
     at = np.searchsorted(np.cumsum(counts), np.ceil([0.5 * total, 0.99 * total, 0.999 * total]))
+    # the middle of a bin; in the last bin, and above the worst time, the worst time itself
     p50, p99, p999 = np.where(
         at == TIME_BINS, worst, np.minimum((at + 0.5) * TIME_BIN, worst)
     ).tolist()

@@ -85,6 +85,7 @@ class Running(Closes):
             )
         recording = Recorder(path, replace=is_replaced)
         try:
+            # first: a refused file needs no request to the worker
             recording.open()
             self.begin_recording(recording, *self.worker.call("save", self.slot))
         except BaseException:

@@ -144,6 +144,7 @@ class Session(Closes):
             self.rendering, profile_of(device), rate, self.handle.scale,
             radius_of(shell, cells.grid.voxel_size),
         )  # fmt: skip
+        # from here on `close` ends what was begun
         self._pid = os.getpid()
         self._supervisor: Supervisor | None = None
         self._running: _DeviceSession | None = None
@@ -176,6 +177,7 @@ class Session(Closes):
 
     def _begin(self, device: Device, staleness: float, seconds: float | None) -> None:
         if self._recording is not None:
+            # first: an existing file is refused before the worker starts
             self._recording.open()
         shared = SharedTable.create(1, max(int(RING_SECONDS * self.timing.rate), LEAST_RING))
         cells = self.cells
@@ -195,6 +197,7 @@ class Session(Closes):
         worker = running.worker = WorkerProcess(request)
         if self._recording is not None:
             running.begin_recording(self._recording, 0, worker.ready, self.frames_on)
+        # last: supervised once its worker and recording exist
         self._supervisor.sessions[1] = running
 
     def __del__(self) -> None:
@@ -349,6 +352,7 @@ class _DeviceSession(Running):
         done, ring = self.n_frames, self.shared.rings[self.slot]
         answers = self.cells.table.queue.requests[self.request.reader]
         named = set(answers["objects"][: int(answers["n_objects"])].tolist())
+        # frames since the last call, as far as the ring still has them
         frames = ring[np.arange(max(self._n_seen, done - len(ring)), done) % len(ring)]
         self._n_seen = done
         last = self.shared.last_frame(self.slot)

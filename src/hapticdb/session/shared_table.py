@@ -96,6 +96,7 @@ class SharedTable(Closes):
 
     def lose(self, row: int, session: int) -> None:
         """Mark a session's worker as dead, unless the slot is free or another's by now."""
+        # id compared under the lock: a slot given to another session stays as it is
         with self._taking:
             if self.slots["state"][row] == TAKEN and self.slots["id"][row] == session:
                 self.slots["state"][row] = LOST

@@ -43,6 +43,7 @@ def undisturbed(processor: int | None = None) -> Iterator[None]:
     At the end all settings are restored.
     """
     switch, was_enabled = sys.getswitchinterval(), gc.isenabled()
+    # collected, then frozen: survivors of the start are in no later collection
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -54,6 +55,7 @@ def undisturbed(processor: int | None = None) -> Iterator[None]:
             os.sched_setaffinity(0, {processor})
         yield
     finally:
+        # in reverse order of the changes above
         if processor is not None:
             os.sched_setaffinity(0, processors)
         _set_slack(slack)

@@ -206,6 +206,7 @@ class ResidentCells(Closes):
         cells have distances and an object was written that has none.
         """
         with self._supervising:
+            # under the lock: `close` sets this before it takes the lock
             if self.table.cells.control["is_over"]:
                 return
             is_alive = self._process.is_alive  # read first: its last message may come with its end
@@ -230,6 +231,7 @@ class ResidentCells(Closes):
                     self._lost_by = str(message.content)
         except (GridError, UsageError) as error:
             self._failure = error
+        # any other error ended the process; `supervise` starts the next one
         except HapticDBError:
             return
         if self._failure is not None:

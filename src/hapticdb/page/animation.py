@@ -129,6 +129,7 @@ def _move(
     )  # fmt: skip
     words = f"{number + 1}. {names_of(found.parts)}: {found.verdict}"
     label = server.scene.add_label(f"/words_{number}", words, position=tuple(top), visible=False)
+    # vertices are sent relative to their middle: the node's poses carry it
     from_middle = np.eye(4)
     from_middle[:3, 3] = middle
     return _Move(node, poses @ from_middle, label)

@@ -47,6 +47,7 @@ class DatabaseThread:
                 then(answer)
 
         try:
+            # a full queue is an error, not a wait of the caller
             self._jobs.put_nowait(work)
         except queue.Full:
             failed(HapticDBError("the database is busy with other people's wishes: try again"))
@@ -70,5 +71,6 @@ class DatabaseThread:
     def _opened(self) -> Environment:
         """The environment, opened on first use."""
         if self._env is None:
+            # in this thread, the only one that may use it
             self._env = open_environment(self._url, read_only=self._read_only)
         return self._env

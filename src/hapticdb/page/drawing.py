@@ -135,11 +135,13 @@ class HandDrawing:
 
     def show(self, tool: Floats, hand: Floats, wrench: Floats) -> None:
         """Show the wrench (6,), N and N m, at the tool (7,), and a line from the hand (7,)."""
+        # forces in units of the scene: one threshold for positions and forces
         seen = np.concatenate([tool[:3], hand[:3], wrench / self.cap * self._diagonal])
         if np.abs(seen - self._seen).max() < LEAST_DRAWN * self._diagonal:
             return
         self._seen = seen
         with self._client.atomic():
+            # a torque is drawn as its force at this lever
             place, lever = tool[:3], 0.03 * self._diagonal
             self.point(self._force, place, wrench[:3])
             self.point(self._torque, place, wrench[3:] / lever)
@@ -189,6 +191,7 @@ class HandDrawing:
 
     def rest(self) -> None:
         """Hide the wrench, the contacts and the line to the tool."""
+        # far from all values: the next `show` draws
         self._seen = np.full(12, 1e300)
         for node in (self._force, self._torque, self._tether, self._contacts):
             node.visible = False

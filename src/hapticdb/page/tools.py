@@ -150,6 +150,7 @@ def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:
     lower = np.stack([low + corner, low + after, high + after], axis=-1)
     upper = np.stack([low + corner, high + after, high + corner], axis=-1)
     faces = np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
+    # equal corners become one: a ring on the axis is a point, and flat triangles go
     vertices, number = np.unique(np.round(rings.reshape(-1, 3), 9), axis=0, return_inverse=True)
     faces = number.reshape(-1)[faces]
     is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
@@ -169,6 +170,7 @@ def _hull(points: Floats) -> tuple[Floats, NDArray[np.int64]]:
     faces = hull.simplices.astype(np.int64)
     corners = points[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # qhull's facets have no winding: compared with their outward normals
     is_inward = np.einsum("fk,fk->f", normals, hull.equations[:, :3]) < 0.0
     faces[is_inward] = faces[is_inward][:, ::-1]
     return points, faces
@@ -182,6 +184,7 @@ def start_pose(bounds: Floats, up: Floats, toward: Floats, radius: float, number
     """
     middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
     side = np.cross(up, toward)
+    # 0, 1, -1, 2, -2: in turn to both sides
     steps = (number + 1) // 2 * (1 if number % 2 else -1)
     position = middle + up * (float(np.abs(up) @ half) + 1.3 * radius)
     position = (

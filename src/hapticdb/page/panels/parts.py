@@ -179,6 +179,7 @@ class PartsPanel:
                 position=middle,
             )  # fmt: skip
             if not self._voxel_box.value:
+                # unticked while they were added
                 self._clear_voxels()
 
         self._browser.site.database.submit(centers, draw, self._browser.failed)

@@ -58,6 +58,7 @@ class PartTree:
                     self._inside = self._gui.add_folder(None)
                 n_listed = self._add_hits(names, search) if search else self._add_tree(names)
                 if before is not None:
+                    # after the new list is there
                     before.remove()
                 more = "" if n_listed == len(names) else f"{n_listed:,} of "
                 self._where.content = note_html(f"{more}{len(names):,} parts. ✓ chosen, ○ hidden")
@@ -113,6 +114,7 @@ class PartTree:
     def _press(self, event: "GuiEvent[Any]", labels: dict[str, Ids]) -> None:
         label = checks.text_of(event.target.value, 2048, "a part")
         if label not in labels:
+            # with its marks; without them first, since a name may begin with one
             label = label.removeprefix(CHOSEN).removeprefix(HIDDEN)
         if label not in labels:
             raise UsageError("this part is there no longer: press another")

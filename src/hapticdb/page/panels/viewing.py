@@ -99,6 +99,7 @@ class ViewControls:
 
     def seen_from(self, origin: Floats, way: Floats) -> Floats:
         """Where a ray (3,), (3,) from the eye passes the near plane."""
+        # the near plane is at `near` along the view, so farther along an oblique ray
         along = float(way @ self._depths()[0])
         return origin + way * (self._camera.near / along) if along > 0.0 else origin
 

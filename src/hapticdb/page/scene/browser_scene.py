@@ -120,6 +120,7 @@ class BrowserScene:
         """Make objects see-through; solid again if all of them are."""
         with self._contents.lock:
             wanted = set(ids)
+            # all are see-through already: solid; else the missing ones join them
             self._state.sheer ^= (
                 wanted if wanted <= self._state.sheer else wanted - self._state.sheer
             )
@@ -129,6 +130,7 @@ class BrowserScene:
         """Show objects, hidden ones too, in these colours, and fade all others; {} ends it."""
         with self._contents.lock:
             before, self._state.spotlit = self._state.spotlit, dict(colours)
+            # at its begin and end all other objects fade or return
             is_whole = bool(before) != bool(colours)
             self._draw(list(self._contents.records) if is_whole else before | self._state.spotlit)
 
@@ -150,6 +152,7 @@ class BrowserScene:
         offset = start[0] - start[1]
         offset *= radius / np.sin(FIELD_OF_VIEW / 2) / max(float(np.linalg.norm(offset)), 1e-12)
         for step in range(1, FLIGHT_STEPS + 1):
+            # smoothstep: the camera starts and ends at rest
             share = (step / FLIGHT_STEPS) ** 2 * (3.0 - 2.0 * step / FLIGHT_STEPS)
             eye, target = start + share * (np.stack([middle + offset, middle]) - start)
             with self._client.atomic():

@@ -68,6 +68,7 @@ def _welded(vertices: NDArray[np.floating], shape: NDArray[np.int64]) -> NDArray
     """Indices (V,) of vertices, equal for equal positions in the same shape (V,)."""
     keys = np.empty((len(vertices), 4))
     keys[:, :3], keys[:, 3] = vertices + 0.0, shape  # -0.0 equals 0.0, but its bits differ
+    # one hashed integer for each position; a collision shows below, then rows are compared
     mixed = (keys.view(np.uint64) * _MIX).sum(axis=1, dtype=np.uint64)
     mixed ^= mixed >> np.uint64(29)
     _, first, number = np.unique(mixed, return_index=True, return_inverse=True)
@@ -83,6 +84,7 @@ def _smooth_pairs(triangles: NDArray[np.float64], points: NDArray[np.int64]) -> 
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
     starts, ends = points.reshape(-1), np.roll(points, -1, axis=1).reshape(-1)
     low, high = np.minimum(starts, ends), np.maximum(starts, ends)
+    # an edge without direction as one integer: equal neighbours in order are its two faces
     key = low * (int(points.max()) + 1) + high
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(np.diff(key[order]) == 0)
@@ -90,6 +92,7 @@ def _smooth_pairs(triangles: NDArray[np.float64], points: NDArray[np.int64]) -> 
     smooth = (normals[one // 3] * normals[other // 3]).sum(axis=1) > SHARP
     one, other = one[smooth], other[smooth]
     one_end, other_end = _next_corner(one), _next_corner(other)
+    # faces of one winding run an edge in opposite directions; along: in the same one
     along = starts[one] == starts[other]
     first = np.stack([one, np.where(along, other, other_end)], axis=1)
     second = np.stack([one_end, np.where(along, other_end, other)], axis=1)
@@ -135,6 +138,7 @@ def coarsened(voxels: NDArray[np.int64], most: int) -> Blocks:
 def block_facets(blocks: Blocks) -> Facets:
     """Exposed sides of cubes, in voxels from the grid's origin."""
     places = blocks.places
+    # a margin of one cube: neighbours beyond the border have keys, too
     low = places.min(axis=0) - 1
     shape = places.max(axis=0) - low + 2
     keys = np.ravel_multi_index((places - low).T, shape)

@@ -76,16 +76,19 @@ class BatchNode:
                 continue
             if self._is_boxes:
                 self._poses[slot, :3, 3] = member.box.mean(axis=0)
+                # never 0, which would hide a flat box
                 self._edges[slot] = np.maximum(member.box[1] - member.box[0], 1e-9)
             else:
                 self._poses[slot] = member.pose
         wxyzs, positions = quaternion_of(self._poses[:, :3, :3]), self._poses[:, :3, 3].copy()
         found = {}
+        # a geometry has one opacity
         for opacity in set(opacities.tolist()) - {-1}:
             is_seen = (opacities == opacity).astype(np.float64)
             sizes = is_seen[:, None] * self._edges if self._is_boxes else is_seen
             for n, (painted, geometry) in enumerate(self._geometries):
                 shades = [
+                    # the file's colour of the piece, unless the audience colours the object
                     ((painted if colour == member.colour else None) or colour or (0, 0, 0))[:3]
                     for colour, member in zip(colours, self._slots, strict=True)
                 ]
@@ -157,17 +160,20 @@ class _MergedNode:
             if colour is None or member.shape is None:
                 continue
             for n, piece in enumerate(member.shape.pieces):
+                # an audience's colour keeps the piece's opacity; an opacity of its own wins
                 shade = (*colour[:3], _OPAQUE if piece.colour is None else piece.colour[3])
                 if len(colour) == 4:
                     shade = colour
                 elif piece.colour is not None and colour == member.colour:
                     shade = piece.colour
                 own = shade == (*member.colour, _OPAQUE)
+                # behind a hyphen: `Contents` finds the node by the text before it
                 name = self.name if own else f"{self.name}-{bytes(shade).hex()}"
                 of_colour.setdefault((name, shade), []).append((member, n))
         return {name: self._drawing(some, colour) for (name, colour), some in of_colour.items()}
 
     def _drawing(self, pieces: list[tuple[Member, int]], colour: Rgba) -> Drawing:
+        # equal bytes are equal triangles, which are not sent again
         key = tuple(
             (member.id, member.shape and member.shape.serial, n, member.pose.tobytes())
             for member, n in pieces
@@ -195,6 +201,7 @@ def merged(pieces: Sequence[tuple[Member, int]], center: NDArray[np.float64]) ->
         if member.shape is None:
             continue
         drawn = member.shape.pieces[n].facets
+        # about the node's centre in double precision; rounded to float32 last
         turn, at = member.pose[:3, :3], member.pose[:3, 3] - center
         vertices.append((drawn.vertices @ turn.T + at).astype(np.float32))
         faces.append(drawn.faces + np.uint32(n_vertices))
@@ -206,6 +213,7 @@ def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
     """Nodes with new names for members with shapes: repeated shapes instanced, others merged."""
     of_shape: dict[int, list[Member]] = {}
     for member in members:
+        # by identity: equal parts share one shape
         of_shape.setdefault(id(member.shape), []).append(member)
     nodes: list[Node] = []
     rest: dict[Colour, list[Member]] = {}
@@ -233,6 +241,7 @@ def _runs(members: list[Member]) -> list[list[Member]]:
     low = centers.min(axis=0)
     size = max(float((centers - low).max()), 1e-12)
     steps = np.minimum((centers - low) / size * 1024, 1023).astype(np.int64)
+    # along the Z-order neighbours in space are in one run
     order = np.argsort(_interleaved(steps), kind="stable").tolist()
     runs: list[list[Member]] = []
     n_triangles = 0

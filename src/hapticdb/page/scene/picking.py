@@ -69,6 +69,7 @@ def _slabs(
     with np.errstate(divide="ignore", invalid="ignore"):
         one = (boxes[:, 0] - room[:, None] - start) / ray
         other = (boxes[:, 1] + room[:, None] - start) / ray
+    # fmin and fmax skip NaN: 0 / 0 for a ray in the plane of a side
     enters = np.fmax.reduce(np.fmin(one, other), axis=1)
     leaves = np.fmin.reduce(np.fmax(one, other), axis=1)
     return np.maximum(enters, 0.0), leaves

@@ -27,6 +27,7 @@ class Placed(NamedTuple):
     def key(self) -> bytes:
         """Bytes of the rounded stretch, equal for stretches equal up to rounding errors."""
         size = max(float(np.abs(self.stretch).max()), 1e-300)
+        # a power of two as the unit: sizes that differ by rounding share it
         exponent = round(math.log2(size))
         steps = np.round(self.stretch / (SAME * 2.0**exponent))
         return np.append(steps, exponent).astype(np.int64).tobytes()
@@ -42,10 +43,12 @@ def _decompose(placement: bytes) -> Placed:
     transform = np.frombuffer(placement).reshape(4, 4)
     pose = np.eye(4)
     pose[:3, 3] = transform[:3, 3]
+    # A = (U V^T) (V S V^T), which a singular placement has, too
     left, sizes, right = np.linalg.svd(transform[:3, :3])
     rotation = left @ right
     stretch = right.T @ (sizes[:, None] * right)
     if np.linalg.det(rotation) < 0:
+        # the reflection goes into the stretch: the pose stays a rotation
         mirror = np.diag([-1.0, 1.0, 1.0])
         rotation, stretch = rotation @ mirror, mirror @ stretch
     pose[:3, :3] = rotation

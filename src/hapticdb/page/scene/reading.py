@@ -83,6 +83,7 @@ class ShapeReader:
                 for obj, part in parts_of(store, ordered):
                     if self._ended.is_set():
                         return
+                    # never between equal parts, which are instances of one node
                     if obj.digest != digest and (
                         n_triangles > SHOW_TRIANGLES or monotonic() - shown > SHOW_EVERY_S
                     ):
@@ -111,6 +112,7 @@ class ShapeReader:
         shape = self._shapes.get(key)
         if shape is None:
             faces = part.faces
+            # a mirrored part: reversed, so that normals still point outward
             if np.linalg.det(placed.stretch) < 0:
                 faces = faces[:, ::-1]
             shape = PartShape(Facets(part.vertices @ placed.stretch.T, faces), part.colours)
@@ -122,6 +124,7 @@ def _cloud(obj: Object, part: Part) -> PartShape:
     """At most `MOST_DOTS` points of a cloud, world frame, in its colours or coloured by height."""
     points, colours = part.world_points(), part.colours
     if len(points) > MOST_DOTS:
+        # a random choice thins all places alike; with a fixed seed, in each session
         some = np.random.default_rng(0).permutation(len(points))[:MOST_DOTS]
         points, colours = points[some], None if colours is None else colours[some]
     low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
@@ -132,6 +135,7 @@ def _cloud(obj: Object, part: Part) -> PartShape:
     shape.dots = Dots(
         (points - shape.center).astype(np.float32),
         by_height(points[:, up_axis([obj])]) if colours is None else colours[:, :3],
+        # mean spacing on the two longest edges, the second taken as a hundredth at least
         float(np.sqrt(edges[2] * max(edges[1], edges[2] / 100) / len(points))),
     )
     return shape

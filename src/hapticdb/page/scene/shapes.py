@@ -86,6 +86,7 @@ class PartShape:
         vertices, faces = self.drawn
         found = []
         for number, colour in enumerate(self._palette):
+            # the vertices of this colour alone, renumbered
             used, corners = np.unique(faces[self._number == number], return_inverse=True)
             own = corners.reshape(-1, 3).astype(np.uint32)
             found.append(Piece(colour, Facets(vertices[used], own)))
@@ -93,6 +94,7 @@ class PartShape:
 
     def bounds(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """AABB (2, 3) of the turned bounding box at a pose (4, 4), metres, world frame."""
+        # |R| h: half the edges of a turned box's AABB
         reach = np.abs(pose[:3, :3]) @ self.half
         return np.stack([pose[:3, 3] - reach, pose[:3, 3] + reach])
 
@@ -134,6 +136,7 @@ class PartShape:
         across = float(normal @ direction)
         if across != 0.0:
             distance = float(normal @ (a - origin)) / across
+            # a plane nearly along the ray gives any distance: then Embree's own is taken
             if abs(distance - skipped - float(found["tfar"][0]) / scale) < 1e-3 * self.radius:
                 return distance
         return skipped + float(found["tfar"][0]) / scale

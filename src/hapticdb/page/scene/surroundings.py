@@ -50,6 +50,7 @@ def framing(box: NDArray[np.float64], up: int, reach: float = 0.0) -> View:
     toward = np.zeros(3)
     toward[[(up + 1) % 3, (up + 2) % 3, up]] = TOWARDS
     toward /= np.linalg.norm(toward)
+    # at this distance the sphere touches the cone of the field of view
     return View(center + toward * radius / np.sin(FIELD_OF_VIEW / 2), center)
 
 
@@ -83,6 +84,7 @@ def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
     radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
     spacing = 10.0 ** np.floor(np.log10(radius / 2))
     center = box.mean(axis=0)
+    # snapped to the tenth lines, which are then at round coordinates
     center = np.round(center / (10 * spacing)) * 10 * spacing
     center[up] = box[0, up]
     edge = float(np.ceil(GROUND_EDGE * radius / spacing) * spacing)

@@ -10,7 +10,7 @@ import trimesh
 
 import hapticdb
 from children import until
-from hapticdb.page.connection import PageConnection, PageRequest, Visitor
+from hapticdb.page.connection import MachineFiles, PageConnection, PageRequest, Visitor
 from hapticdb.page.page_process import new_server, open_page
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
@@ -48,14 +48,16 @@ def two_parts(folder: Path) -> Path:
 
 @contextmanager
 def page_of(
-    url: Path, *, recordings: Path | None = None, is_direct: bool = False
-) -> Iterator[tuple[Site, PagePerson, TabbedBrowser]]:
+    url: Path, *, recordings: Path | None = None, is_direct: bool = False,
+    machine: MachineFiles | None = None,
+) -> Iterator[tuple[Site, PagePerson, TabbedBrowser]]:  # fmt: skip
     """Open the page of an environment, with one editor at it."""
     server = new_server()
     ours, theirs = socket.socketpair()
     request = PageRequest(
         dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), 0, 0, "",
         None if recordings is None else str(recordings), is_direct=is_direct,
+        machine=machine,
     )  # fmt: skip
     with ExitStack() as ending:
         ending.callback(ours.close)

@@ -8,6 +8,7 @@ import hapticdb
 from hapticdb.cli import main
 from hapticdb.cli.options import RenderingName
 from hapticdb.cli.verbs.serving import PageOptions, _tokens
+from hapticdb.cli.verbs.sweeping import MachineOptions
 from hapticdb.server.access import Role
 from hapticdb.server.lifecycle import _page_request
 from hapticdb.session.processes import fork_server
@@ -24,6 +25,7 @@ def scene(tmp_path: Path) -> Path:
     ("args", "words"),
     [
         ("--host 192.0.2.1", "--token"), ("--token-file none", "--token-file none"),
+        ("--machine none.urdf", "none.urdf: no such file"), ("--joints q.csv", "--machine"),
         ("--tool none.stl", "no such file"), ("--prefix a\tb", "--prefix"),
         ("--tls-cert cert.pem", "--tls-key"), ("--seconds 0", "--seconds"),
         ("--role-url editor=none.db", "none.db"), ("owner=0123456789abcdef", "viewer, toucher"),
@@ -75,6 +77,10 @@ def test_a_token_file_may_have_a_byte_order_mark_and_comments(tmp_path: Path) ->
 
 @pytest.mark.parametrize("rendering", [None, "coupled", "direct"])
 def test_a_rendering_reaches_host_and_page(scene: Path, rendering: RenderingName | None) -> None:
-    serving = PageOptions(rendering=rendering).serving(str(scene), {})
+    machine = MachineOptions(str(scene), at="0,0,1000,1,0,0,0")
+    serving = PageOptions(rendering=rendering).serving(str(scene), {}, machine)
     assert serving.rendering == rendering
-    assert _page_request(serving, 0, 0, "").is_direct == (rendering == "direct")
+    request = _page_request(serving, 0, 0, "")
+    assert request.is_direct == (rendering == "direct")
+    assert request.machine is not None
+    assert (request.machine.machine, request.machine.at[2, 3]) == (str(scene), 1.0)

@@ -44,6 +44,11 @@ budget SIZE [256MiB]: Memory for resident cells, MiB or such as 4GiB.
 on ADDRESS: Have workers of dask.distributed do it: its scheduler, tcp://host:8786.
 layout [brick]: Index table of a new environment.
 curve [z]: Order of the keys of a new environment.
+machine FILE: A machine with joints, URDF, or MJCF (extra machines); for a sweep instead of --tool.
+joints CSV: Its path: a column a joint, rad or m, or a header such as 'elbow [deg]'.
+srdf FILE: Pairs of its links that are not tested.
+at POSE [the world's frame]: Where its base stands: x,y,z,qw,qx,qy,qz, millimetres, or such as
+  0,5,0.2in,1,0,0,0; or a CSV file of one pose, metres.
 contact LENGTH/mm [0.05]: what is so near where the path starts may be touched; a motion by so much
   has to free the tool from it all along.
 overlap LENGTH/mm [0]: by so much a part may overlap others where it stands.
@@ -139,11 +144,6 @@ serve.log_json: Write the log as JSON, an object a line.
 replay.recording FILE: A session's .hdbrec.
 replay.url URL: The environment; unless given, the recorded one if its file is beside FILE.
 
-sweep.machine FILE: Instead of --tool: a machine with joints, URDF, or MJCF (extra machines).
-sweep.joints CSV: Its path: a column a joint, rad or m, or a header such as 'elbow [deg]'.
-sweep.srdf FILE: Pairs of its links that are not tested.
-sweep.at POSE [the world's frame]: Where its base stands: x,y,z,qw,qx,qy,qz, millimetres, or such as
-  0,5,0.2in,1,0,0,0; or a CSV file of one pose, metres.
 sweep.part WORDS: Instead of --tool: objects that move, all together.
 sweep.path FILE: Poses, as for touch --poses.
 sweep.about X,Y,Z/mm [middle of the tool's box]: the centre of the path's turns, tool's frame.

@@ -17,7 +17,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
+    import numpy as np
     import viser
+    from numpy.typing import NDArray
     from viser.infra import Message, WebsockClientConnection
     from websockets.asyncio.server import ServerConnection
 
@@ -39,6 +41,15 @@ MOST_FAILED = 20
 Larger: a longer log from such a client."""
 
 
+class MachineFiles(NamedTuple):
+    """Arguments of `read_machine`, a joint path, and the base's first pose (4, 4), metres."""
+
+    machine: str
+    srdf: str | None
+    joints: str | None
+    at: "NDArray[np.float64]"
+
+
 class PageRequest(NamedTuple):
     """Arguments of the page process.
 
@@ -56,6 +67,7 @@ class PageRequest(NamedTuple):
     recordings: str | None = None
     title: str = ""
     is_direct: bool = False
+    machine: MachineFiles | None = None
 
 
 class Visitor(NamedTuple):

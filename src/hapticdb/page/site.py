@@ -13,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.machines.joint_path import checked_values, read_joints
+from hapticdb.machines.machine import Machine
+from hapticdb.machines.reader import read_machine
 from hapticdb.page import tools
 from hapticdb.page.connection import PageConnection, PageRequest
 from hapticdb.page.database import DatabaseThread
@@ -108,6 +111,15 @@ class Site:
             *tools.from_files(request.tools, facts.voxel_size, has_distances=facts.has_distances),
             *tools.built_in(facts.diagonal, facts.voxel_size, has_distances=facts.has_distances),
         ]
+        self.machine: tuple[Machine, Floats] | None = None
+        if (files := request.machine) is not None:
+            machine = read_machine(files.machine, files.srdf)
+            q = np.zeros((1, len(machine.driven)))
+            self.machine = (
+                machine,
+                q if files.joints is None else read_joints(files.joints, machine),
+            )
+            checked_values(*self.machine)
         set_first_view(self.server, facts.bounds, self.view.up, facts.reach(self.tools[0].radius))
         self.clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)
         """Updates all browsers, once it is started."""
@@ -160,6 +172,7 @@ class Site:
         """Text of an error for browsers; see `wording.error_text`."""
         request = self.request
         files = [obj.link for obj in self.objects.values()] + list(request.tools)
+        files += [] if request.machine is None else [request.machine.machine]
         folders = {file.rpartition("/")[0] for file in files}
         if request.recordings is not None:
             folders.add(request.recordings)

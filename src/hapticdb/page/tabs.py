@@ -6,6 +6,7 @@ from hapticdb.page import checks
 from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
 from hapticdb.page.panels.clashes import ClashPanel
+from hapticdb.page.panels.machine import MachinePanel
 from hapticdb.page.panels.parts import PartsPanel
 from hapticdb.page.panels.record import RecordPanel
 from hapticdb.page.panels.sweeps import SweepPanel
@@ -32,6 +33,9 @@ class TabbedBrowser(Browser):
             self.parts = PartsPanel(self, gui)
         with tabs.add_tab("Sweep"):
             SweepPanel(self, gui)
+        if site.machine is not None:
+            with tabs.add_tab("Machine"):
+                MachinePanel(self, gui, *site.machine)
         with tabs.add_tab("Clashes"):
             self.clashes = ClashPanel(self, gui)
         with tabs.add_tab("Record"):

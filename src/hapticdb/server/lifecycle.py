@@ -111,7 +111,7 @@ def _page_request(serving: Serving, server: int, host: int, secret: str) -> Page
     urls = {role.word: url for role, url in serving.urls.items()}
     return PageRequest(
         urls, serving.tools, server, host, secret, serving.recordings, serving.title,
-        is_direct=serving.rendering == "direct",
+        is_direct=serving.rendering == "direct", machine=serving.machine,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from hapticdb.server.access import Access, Role
 from hapticdb.server.limits import Limits
 
 if TYPE_CHECKING:
+    from hapticdb.page.connection import MachineFiles
     from hapticdb.server.metrics import Metrics
     from hapticdb.session.coupling import Rendering
     from hapticdb.session.host import SessionHost
@@ -46,6 +47,7 @@ class Serving:
     title: str = "hapticdb"
     recordings: str | None = None
     rendering: "Rendering | None" = None
+    machine: "MachineFiles | None" = None
     limits: Limits = field(default_factory=Limits)
     page: str = PAGE
 

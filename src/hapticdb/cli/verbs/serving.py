@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 from hapticdb.cli import render
 from hapticdb.cli.options import RenderingName
 from hapticdb.cli.root import ended_by_signals, exit_by
+from hapticdb.cli.values import pose_of
+from hapticdb.cli.verbs.sweeping import MachineOptions
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
 if TYPE_CHECKING:
+    from hapticdb.page.connection import MachineFiles
     from hapticdb.server.access import Role
     from hapticdb.server.served import Serving
 
@@ -26,8 +29,9 @@ class PageOptions:
     seconds: float | None = None
 
     def serving(
-        self, url: str, tokens: "dict[str, Role]", role_urls: Sequence[str] = ()
-    ) -> "Serving":
+        self, url: str, tokens: "dict[str, Role]", machine: MachineOptions,
+        role_urls: Sequence[str] = (),
+    ) -> "Serving":  # fmt: skip
         """Settings of the server; UsageError for missing files, or a coupling without distances."""
         from contextlib import closing
 
@@ -54,7 +58,24 @@ class PageOptions:
             open_role=None if tokens else Role.EDITOR, rendering=self.rendering,
             title=f"{Path(redact(url).partition('?')[0]).stem} - hapticdb",
             recordings=None if folder is None else str(Path(folder).resolve()),
+            machine=_machine_files(machine),
         )  # fmt: skip
+
+
+def _machine_files(given: MachineOptions) -> "MachineFiles | None":
+    import numpy as np
+
+    from hapticdb.page.connection import MachineFiles
+
+    if given.machine is None:
+        if given != MachineOptions():
+            raise UsageError("--joints, --srdf and --at belong to --machine: give it, too")
+        return None
+    for name, file in vars(given).items():
+        if name != "at" and file is not None and not Path(file).is_file():
+            raise UsageError(f"--{name} {file}: no such file")
+    at = np.eye(4) if given.at is None else pose_of(given.at, "--at")
+    return MachineFiles(given.machine, given.srdf, given.joints, at)
 
 
 @dataclass(frozen=True)
@@ -69,7 +90,7 @@ class ReachOptions:
     tls_key: str | None = None
 
 
-def view(url: str, *, page: PageOptions, no_browser: bool = False) -> None:
+def view(url: str, *, page: PageOptions, machine: MachineOptions, no_browser: bool = False) -> None:
     """See and feel in a browser.
 
     Example: hapticdb view car.db --tool spanner.stl
@@ -78,7 +99,7 @@ def view(url: str, *, page: PageOptions, no_browser: bool = False) -> None:
     from hapticdb.server.access import Role, make_token
 
     token = make_token()
-    serving = page.serving(url, {token: Role.EDITOR})
+    serving = page.serving(url, {token: Role.EDITOR}, machine)
 
     def ready(port: int) -> None:
         address = serving.address(port, token)
@@ -93,6 +114,7 @@ def serve(
     url: str,
     *,
     page: PageOptions,
+    machine: MachineOptions,
     token: bool = False,
     token_file: str | None = None,
     role_url: list[str] | None = None,
@@ -106,7 +128,7 @@ def serve(
     _check_extra()
     tokens = _tokens(token_file, are_made=token)
     serving = replace(
-        page.serving(url, tokens, role_url or ()), host=reach.host, port=reach.port,
+        page.serving(url, tokens, machine, role_url or ()), host=reach.host, port=reach.port,
         prefix=reach.prefix.rstrip("/"), host_names=tuple(reach.host_name or ()),
         certificate=reach.tls_cert, key=reach.tls_key,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
 from hapticdb.exact.sweep import sweep
-from hapticdb.exact.sweep_report import gap_text, percent, verdict_line
+from hapticdb.exact.sweep_report import gap_text, name_of, percent, verdict_line
 from hapticdb.exact.swept import PathPlace, Swept
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
@@ -89,20 +89,7 @@ class SweepPanel:
         place = swept.hits[0] if swept.hits else swept.gap.place
         if place is not None:
             self._draw(shell, swept, place, name)
-        line = verdict_line(swept, shell)
-        hit = "".join(
-            f"<div>{swatch(colours.of_object(place.object.id))}"
-            f"{escaped(short_name(place.object.name))} · at {percent(place.fraction)}</div>"
-            for place in swept.hits[:MOST_NAMED]
-        )
-        more = len(swept.hits) - MOST_NAMED
-        self._work.said.content = (
-            '<div style="margin:2px 12px;font-size:0.85em">'
-            f'<b style="color:{COLOURS[swept.verdict.exit_status]}">'
-            f"{escaped(name)}: {escaped(swept.verdict)}</b>"
-            f'<div style="margin:3px 0">{escaped(plain_name(line))}</div>{hit}'
-            f"{f'<div>and {more} more</div>' if more > 0 else ''}</div>"
-        )
+        self._work.said.content = swept_html(swept, verdict_line(swept, shell), name)
         self._clear.visible = True
 
     def _draw(self, shell: PointShell, swept: Swept, place: PathPlace, name: str) -> None:
@@ -132,6 +119,23 @@ class SweepPanel:
             node.remove()
         self._drawn = []
         self._clear.visible = False
+
+
+def swept_html(swept: Swept, line: str, name: str) -> str:
+    """HTML of a result: the verdict about a name, its line, and the hits."""
+    hit = "".join(
+        f"<div>{swatch(colours.of_object(place.object.id))}"
+        f"{escaped(short_name(name_of(place)))} · at {percent(place.fraction)}</div>"
+        for place in swept.hits[:MOST_NAMED]
+    )
+    more = len(swept.hits) - MOST_NAMED
+    return (
+        '<div style="margin:2px 12px;font-size:0.85em">'
+        f'<b style="color:{COLOURS[swept.verdict.exit_status]}">'
+        f"{escaped(name)}: {escaped(swept.verdict)}</b>"
+        f'<div style="margin:3px 0">{escaped(plain_name(line))}</div>{hit}'
+        f"{f'<div>and {more} more</div>' if more > 0 else ''}</div>"
+    )
 
 
 def _path(

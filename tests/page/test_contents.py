@@ -42,7 +42,7 @@ class Shown:
         reader.read(self.objects)
         until(lambda: self.contents.waiting() == 0)
         reader.close()
-        reader.join(60.0)
+        reader.thread.join(60.0)
 
     def of(self, ids: set[int]) -> NDArray[np.float64]:
         return np.concatenate([np.empty((0, 3, 3)), *(self.triangles[i] for i in sorted(ids))])

@@ -37,13 +37,6 @@ PAUSE = 0.8
 """Pause before and after each path, seconds."""
 AROUND = 0.6
 """Margin of the surroundings, as a share of the longest edge of the paths' AABB."""
-MOST_TRIANGLES = 400_000
-"""Triangles of the surroundings; the largest objects are dropped first. More: larger file."""
-MOST_BLOCKS = 20_000
-"""Greatest number of blocks for an object without triangles."""
-STANDING: colours.Colour = (186, 193, 201)
-SEEN_THROUGH = 0.45
-"""Opacity of the surroundings, so that hidden parts show through."""
 
 
 class _Move(NamedTuple):
@@ -104,7 +97,7 @@ def _recorded(
     facets, middle = _sent(_standing(env, box, exclude))
     if len(facets.faces):
         server.scene.add_mesh_simple(
-            "/standing", facets.vertices, facets.faces, color=STANDING, opacity=SEEN_THROUGH,
+            "/standing", facets.vertices, facets.faces, color=(186, 193, 201), opacity=0.45,
             side="double", cast_shadow=False, receive_shadow=False, position=middle,
         )  # fmt: skip
     top = box.mean(axis=0)
@@ -166,10 +159,8 @@ def _box_of(steps: Sequence[Extraction], paths: Sequence[Floats]) -> Floats:
     corners = []
     for found, poses in zip(steps, paths, strict=True):
         low, high = found.shell.points.min(axis=0), found.shell.points.max(axis=0)
-        own = corners_of(np.stack([low, high]))
-        corners.append(
-            (own @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
-        )
+        own = corners_of(np.stack([low, high])) @ poses[:, :3, :3].swapaxes(1, 2)
+        corners.append((own + poses[:, None, :3, 3]).reshape(-1, 3))
     every = np.concatenate(corners)
     return np.stack([every.min(axis=0), every.max(axis=0)])
 
@@ -193,9 +184,8 @@ def _standing(env: Environment, box: Floats, exclude: set[int]) -> list[Facets]:
     kept, total = [], 0
     for facets in sorted(shapes.values(), key=lambda one: len(one.faces)):
         total += len(facets.faces)
-        if total > MOST_TRIANGLES:
-            break
-        kept.append(facets)
+        if total <= 400_000:  # the largest objects are dropped
+            kept.append(facets)
     return kept
 
 
@@ -206,7 +196,7 @@ def _of_triangles(triangles: Floats) -> Facets:
 
 
 def _of_voxels(env: Environment, obj: Object) -> Facets:
-    blocks = block_facets(coarsened(env.voxels(obj.id), MOST_BLOCKS))
+    blocks = block_facets(coarsened(env.voxels(obj.id), 20_000))
     corners = np.asarray(env.grid.origin) + env.grid.voxel_size * blocks.vertices
     return Facets(corners, blocks.faces)
 
@@ -214,9 +204,7 @@ def _of_voxels(env: Environment, obj: Object) -> Facets:
 def _sent(several: Sequence[Facets]) -> tuple[Facets, Floats]:
     """One mesh, float32 about its centre (3,) for parts far from the origin, and that centre."""
     if not several:
-        return Facets(
-            np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint32)
-        ), np.zeros(3)
+        return Facets(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint32)), np.zeros(3)
     first = np.cumsum([0, *(len(facets.vertices) for facets in several)])
     faces = [one.faces + start for one, start in zip(several, first.tolist(), strict=False)]
     vertices = np.concatenate([one.vertices for one in several]).astype(np.float64)

@@ -11,10 +11,6 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
 
 LOG = logging.getLogger("hapticdb.page")
-MOST_WAITING = 64
-"""Capacity of the queue."""
-ENDS_WITHIN = 0.2
-"""Poll period of an idle thread, seconds; bounds the time to end it."""
 
 Answer = TypeVar("Answer")
 
@@ -25,7 +21,7 @@ class DatabaseThread:
     def __init__(self, url: str, *, read_only: bool = True) -> None:
         self._url, self._read_only = url, read_only
         self._env: Environment | None = None
-        self._jobs: queue.Queue[Callable[[], None]] = queue.Queue(MOST_WAITING)
+        self._jobs: queue.Queue[Callable[[], None]] = queue.Queue(64)
         self._is_ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="database", daemon=True)
         self._thread.start()
@@ -60,7 +56,7 @@ class DatabaseThread:
     def _run(self) -> None:
         while not self._is_ending.is_set():
             try:
-                self._jobs.get(timeout=ENDS_WITHIN)()
+                self._jobs.get(timeout=0.2)()  # bounds the time to end the thread
             except queue.Empty:
                 continue
             except Exception:

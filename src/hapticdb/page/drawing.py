@@ -20,14 +20,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-LONGEST_ARROW = 0.22
-"""Length of an arrow at the force cap, as a share of the scene's diagonal."""
-ARROW_BEGINS = 1e-3
-"""Least length of an arrow, as a share of the longest."""
 LEAST_DRAWN = 2e-4
 """Least change drawn: of positions as a share of the diagonal, of forces as a share of the cap."""
-HAND_GIZMO = 110.0
-"""Size of the hand's gizmo, pixels. Larger: easier to grab, and hides more."""
 PLUMB: colours.Colour = (70, 80, 95)
 """Colour of the plumb line."""
 CONTACT_SHARE = 0.004
@@ -39,16 +33,19 @@ def add_tool(
 ) -> "MeshHandle":
     """Add a tool's surface to a scene; the pose of its handle is the tool's."""
     return scene.add_mesh_simple(
-        name,
-        tool.vertices,
-        tool.faces,
-        color=colour,
-        opacity=opacity,
-        flat_shading=not tool.is_round,
-        side="double",
-        cast_shadow=opacity is None,
-        receive_shadow=False,
-    )
+        name, tool.vertices, tool.faces, color=colour, opacity=opacity, side="double",
+        flat_shading=not tool.is_round, cast_shadow=opacity is None, receive_shadow=False,
+    )  # fmt: skip
+
+
+def add_arrow(
+    scene: "SceneApi", name: str, colour: colours.Colour, width: float, middle: Floats
+) -> "ArrowsHandle":
+    """Add a hidden arrow with a head of radius `width`, metres, at `middle` (3,)."""
+    return scene.add_arrows(
+        name, np.zeros((1, 2, 3)), colour, shaft_radius=0.35 * width, head_radius=width,
+        head_length=2.2 * width, visible=False, position=middle,
+    )  # fmt: skip
 
 
 def add_marks(
@@ -88,7 +85,7 @@ class HandDrawing:
         self._marked = np.empty((0, 3))
         scene = client.scene
         self.gizmo: TransformControlsHandle = scene.add_transform_controls(
-            "/hand", scale=HAND_GIZMO, fixed=True, line_width=3.0, disable_sliders=True,
+            "/hand", scale=110.0, fixed=True, line_width=3.0, disable_sliders=True,
             opacity=0.9, depth_test=False, visible=False, translation_limits=((-1e9, 1e9),) * 3,
         )  # fmt: skip
         # Visible until the hand moves. Browsers place letters in float32: far away they scatter.
@@ -96,16 +93,9 @@ class HandDrawing:
         self.words = scene.add_label(
             "/hand/words", "", anchor="top-right", visible=step < LEAST_DRAWN * diagonal
         )
-        shaft, head = 0.0035 * diagonal, 0.010 * diagonal
         nothing = np.zeros((1, 2, 3))
-        self._force = scene.add_arrows(
-            "/force", nothing, colours.FORCE, shaft_radius=shaft, head_radius=head,
-            head_length=2.2 * head, visible=False, position=self.middle,
-        )  # fmt: skip
-        self._torque = scene.add_arrows(
-            "/torque", nothing, colours.TORQUE, shaft_radius=0.7 * shaft, head_radius=0.8 * head,
-            head_length=1.8 * head, visible=False, position=self.middle,
-        )  # fmt: skip
+        self._force = add_arrow(scene, "/force", colours.FORCE, 0.01 * diagonal, middle)
+        self._torque = add_arrow(scene, "/torque", colours.TORQUE, 0.008 * diagonal, middle)
         self._tether = scene.add_line_segments(
             "/tether", nothing, (120, 120, 130), thickness=2.0, thickness_units="screen",
             visible=False, position=self.middle,
@@ -156,10 +146,10 @@ class HandDrawing:
 
     def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
         """Show a force (3,), N, at a position by an arrow with its node at `middle`."""
-        longest = LONGEST_ARROW * self._diagonal
+        longest = 0.22 * self._diagonal  # at the force cap
         arrow_vector = force * (longest / self.cap)
         length = float(np.linalg.norm(arrow_vector))
-        is_seen = length > ARROW_BEGINS * longest
+        is_seen = length > 1e-3 * longest
         if is_seen:
             arrow_vector = arrow_vector * (min(length, longest) / length)
             arrow.points = self._sent([[start, start + arrow_vector]])

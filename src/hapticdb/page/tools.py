@@ -20,14 +20,10 @@ from hapticdb.query.law import inset_of
 
 Floats = NDArray[np.float64]
 
-PROBE_SHARE = 0.028
-"""Radius of the ball, as a share of the scene's diagonal."""
 LEAST_VOXELS = 3.0
 """Least radius of a probe, voxels. Larger: smoother forces in coarse grids, and larger probes."""
 POINTS = 400
 """Points of a probe's shell. More: forces from smaller features, and longer frames."""
-PART_POINTS = 1500
-"""Points of a part's shell: parts have more and finer edges than probes."""
 AROUND = 40
 """Segments of a probe's circumference. More: rounder, and more to send."""
 
@@ -63,7 +59,7 @@ def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list
     diagonal : of the scene's AABB, metres; has_distances : whether forces come from distances, so
     that the shell is inset by the law's onset.
     """
-    radius = max(PROBE_SHARE * diagonal, LEAST_VOXELS * voxel_size)
+    radius = max(0.028 * diagonal, LEAST_VOXELS * voxel_size)
     inset = inset_of(voxel_size, "distance" if has_distances else "plane")
     ball = np.linspace(-0.5 * math.pi, 0.5 * math.pi, AROUND // 2 + 1)
     peg = np.linspace(-0.5 * math.pi, 0.0, AROUND // 4 + 1)
@@ -136,14 +132,8 @@ def middle_of(shell: PointShell) -> Floats:
 def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Surface of revolution about the z axis of a profile (P, 2), radius and height."""
     angles = np.arange(AROUND) * (2.0 * math.pi / AROUND)
-    rings = np.stack(
-        [
-            profile[:, :1] * np.cos(angles),
-            profile[:, :1] * np.sin(angles),
-            np.repeat(profile[:, 1:], AROUND, axis=1),
-        ],
-        axis=-1,
-    )
+    radii, heights = profile[:, :1], np.repeat(profile[:, 1:], AROUND, axis=1)
+    rings = np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=-1)
     ring, corner = np.meshgrid(np.arange(len(profile) - 1), np.arange(AROUND), indexing="ij")
     low, high = ring * AROUND, (ring + 1) * AROUND
     after = (corner + 1) % AROUND
@@ -186,11 +176,8 @@ def start_pose(bounds: Floats, up: Floats, toward: Floats, radius: float, number
     side = np.cross(up, toward)
     # 0, 1, -1, 2, -2: in turn to both sides
     steps = (number + 1) // 2 * (1 if number % 2 else -1)
-    position = middle + up * (float(np.abs(up) @ half) + 1.3 * radius)
-    position = (
-        position + toward * (0.35 * float(np.abs(toward) @ half)) + side * (2.6 * radius * steps)
-    )
     pose = np.eye(4)
-    pose[:3, 3] = position
+    pose[:3, 3] = middle + up * (float(np.abs(up) @ half) + 1.3 * radius)
+    pose[:3, 3] += toward * (0.35 * float(np.abs(toward) @ half)) + side * (2.6 * radius * steps)
     pose[:3, :3] = np.column_stack([side, np.cross(up, side), up])
     return pose

@@ -20,7 +20,6 @@ MOST_SAID = 6
 FAULT = "the page failed at this; the operator's log says why"
 """Text of an unexpected error."""
 ENVIRONMENT = "the environment"
-"""Replacement of the environment's address."""
 ADDRESS = re.compile(r"\b[a-zA-Z][\w+.-]*://[^\s'\"]*")
 """A URL, to its end."""
 FOLDERS = re.compile(r"""(?<![^\s'"`(\[<=:,;])/(?=[^\s/])(?:[^/\n:'",;]+/)*""")

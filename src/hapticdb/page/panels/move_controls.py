@@ -19,12 +19,6 @@ from hapticdb.store.base import Object
 if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent, TransformControlsEvent
 
-MOVING_GIZMO = 0.13
-"""Size of the gizmo, as a share of the scene's diagonal. Larger: easier to grab."""
-LEAST_MOTION = 1e-9
-"""Least change of a placement that is written: the largest entry of the change's matrix, metres or
-radians. At 0, a click on the gizmo would be an edit."""
-
 
 @dataclass(eq=False)
 class _DraggedPart:
@@ -87,10 +81,9 @@ class MoveControls:
             start = np.eye(4)
             start[:3, 3] = obj.bounds.mean(axis=0)
             self._part = _DraggedPart(obj, start, start)
-            size = browser.site.facts.diagonal
             self._gizmo = browser.client.scene.add_transform_controls(
-                "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=start[:3, 3],
-                disable_sliders=True, depth_test=False,
+                "/move", scale=0.13 * browser.site.facts.diagonal, line_width=3.5,
+                position=start[:3, 3], disable_sliders=True, depth_test=False,
             )  # fmt: skip
             self._gizmo.on_update(partial(self._dragged, self._part))
 
@@ -143,8 +136,8 @@ class MoveControls:
     def _end_drag(self, part: _DraggedPart, pose: NDArray[np.float64]) -> None:
         """Write the placement at the end of a drag, based on the result of the previous write."""
         browser = self._browser
-        if float(np.abs(pose @ np.linalg.inv(part.left) - np.eye(4)).max()) < LEAST_MOTION:
-            self.renew()
+        if float(np.abs(pose @ np.linalg.inv(part.left) - np.eye(4)).max()) < 1e-9:
+            self.renew()  # a click on the gizmo is no edit
             return
         part.left = pose
         part.n_waiting += 1
@@ -153,9 +146,8 @@ class MoveControls:
             with self._lock:
                 obj, displacement = part.object, part.displacement_to(pose)
             moved = edits.move(obj, displacement)
-            if np.array_equal(
-                moved.transform, displacement @ obj.transform
-            ):  # no later write by others
+            # no later write by others
+            if np.array_equal(moved.transform, displacement @ obj.transform):
                 with self._lock:
                     part.object, part.start = moved, pose
             return moved

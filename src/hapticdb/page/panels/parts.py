@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 MOST_VOXELS = 60_000
-"""Greatest number of voxels drawn of a part; of a larger part, every n-th. Larger: more is sent."""
+"""Greatest number of voxels drawn of a part; of a larger part, every n-th."""
 ACTS = ("Hide", "Show", "Isolate", "See-through", "Show all", "Choose none")
 CHOOSE = "Click a part, or press its name. Ctrl and a click add one."
 
@@ -42,15 +42,13 @@ class PartsPanel:
         with gui.add_folder("Chosen"):
             self._what = gui.add_html(note_html(CHOOSE))
             gui.add_button_group("", ACTS).on_click(guard("viewer", self._show_or_hide))
-            voxels = gui.add_checkbox("Voxels", initial_value=False)
-            voxels.on_update(guard("viewer", self._show_voxels))
-            self._voxel_box = voxels
-            may_touch = browser.visitor.may("toucher")
-            self._take = gui.add_button(
-                "Take this part in hand", visible=may_touch,
+            self._voxel_box = gui.add_checkbox("Voxels", initial_value=False)
+            self._voxel_box.on_update(guard("viewer", self._show_voxels))
+            take = gui.add_button(
+                "Take this part in hand", visible=browser.visitor.may("toucher"),
                 hint="The part becomes your tool: feel whether it comes out.",
             )  # fmt: skip
-            self._take.on_click(guard("toucher", self._take_out))
+            take.on_click(guard("toucher", self._take_out))
             self._back = gui.add_button("Put it back", visible=False)
             self._back.on_click(guard("toucher", lambda _: browser.put_back()))
         with gui.add_folder("Distance", expand_by_default=False):
@@ -106,15 +104,9 @@ class PartsPanel:
             said = note_html(CHOOSE)
         elif len(chosen) == 1:
             obj = chosen[0]
-            said = rows_html(
-                (
-                    ("Part", short_name(obj.name, 80)),
-                    ("Size", size_text(obj)),
-                    ("Voxels", f"{obj.voxels:,}"),
-                    ("File", obj.link.rpartition("/")[2] or "none"),
-                    ("Id", str(obj.id)),
-                )
-            )
+            rows = [("Part", short_name(obj.name, 80)), ("Size", size_text(obj))]
+            rows += [("Voxels", f"{obj.voxels:,}"), ("File", obj.link.rpartition("/")[2] or "none")]
+            said = rows_html([*rows, ("Id", str(obj.id))])
         else:
             total = sum(obj.voxels for obj in chosen)
             said = rows_html((("Parts", f"{len(chosen):,}"), ("Voxels", f"{total:,}")))
@@ -188,20 +180,18 @@ class PartsPanel:
         browser = self._browser
         obj = self._browser.only_chosen()
 
-        def shell(env: Environment) -> PointShell:
-            return env.shell(obj.id, points=tools.PART_POINTS)
-
         def hold(found: PointShell) -> None:
             before, browser.dragged_part = browser.dragged_part, obj.id
             if before is not None and before != obj.id:
                 browser.scene.show((before,))
-            middle = tools.middle_of(found)
-            browser.use_tool(
-                tools.from_shell(obj.name, found), np.array([*middle, 1.0, 0.0, 0.0, 0.0])
-            )
+            start = np.array([*tools.middle_of(found), 1.0, 0.0, 0.0, 0.0])
+            browser.use_tool(tools.from_shell(obj.name, found), start)
             browser.scene.hide((obj.id,))
 
-        browser.site.database.submit(shell, hold, browser.failed)
+        # more points than a probe: parts have more and finer edges
+        browser.site.database.submit(
+            lambda env: env.shell(obj.id, points=1500), hold, browser.failed
+        )
 
     def show_tool(self) -> None:
         """Show the button "Put it back" if a part is dragged."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import FileError, UsageError
 from hapticdb.page import checks, colours
 from hapticdb.page.browser import Browser
-from hapticdb.page.drawing import put_at
+from hapticdb.page.drawing import add_arrow, put_at
 from hapticdb.page.site import checked_file
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import force_text, note_html, rows_html
@@ -137,19 +137,14 @@ class RecordPanel:
             "/replay", shell.outline, colours.TORQUE, point_size=0.004 * size,
             point_shape="circle", precision="float32",
         )  # fmt: skip
-        arrow = scene.add_arrows(
-            "/replay_force", np.zeros((1, 2, 3)), colours.FORCE, shaft_radius=0.0035 * size,
-            head_radius=0.01 * size, head_length=0.02 * size, visible=False, position=middle,
-        )  # fmt: skip
-        self._drawn = [cloud, arrow]
+        self._drawn = [cloud, add_arrow(scene, "/replay_force", colours.FORCE, 0.01 * size, middle)]
         if len(track) > 1:
             segments = np.stack([track[:-1], track[1:]], axis=1) - middle
-            self._drawn.append(
-                scene.add_line_segments(
-                    "/replay_way", segments, colours.TORQUE, thickness=2.0,
-                    thickness_units="screen", position=middle,
-                )
+            way = scene.add_line_segments(
+                "/replay_way", segments, colours.TORQUE, thickness=2.0, thickness_units="screen",
+                position=middle,
             )  # fmt: skip
+            self._drawn.append(way)
 
     def _slide(self, event: "GuiEvent[Any]") -> None:
         if event.client is None or self._replay is None:

@@ -14,10 +14,7 @@ if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent
 
 MOST_FOLDERS, MOST_BUTTONS = 60, 400
-"""Greatest numbers of sub-assemblies and of parts in the tree, the outer ones first. Larger: slower
-to open in a browser."""
-MOST_HITS = 60
-"""Greatest number of listed hits of a search."""
+"""Greatest numbers of sub-assemblies and of parts in the tree, the outer ones first."""
 LONGEST_SEARCH = 200
 """Greatest length of a search, characters."""
 CHOSEN, HIDDEN = "✓ ", "○ "
@@ -76,7 +73,7 @@ class PartTree:
             for path in found_ids({path: path for path in paths}, search)
         ]
         rows += [(short_name(names[i], 44), (i,)) for i in found]
-        self._add_group(self._inside, rows[:MOST_HITS])
+        self._add_group(self._inside, rows[:60])
         return len(found)
 
     def _add_tree(self, names: dict[int, str]) -> int:

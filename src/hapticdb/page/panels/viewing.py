@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 FITS = ("Chosen", "Tool", "All")
-LINK_EVERY = 0.3
-"""Period of the link's update, seconds."""
-MOST_LINKED = 50
-"""Greatest number of parts in a link, as many as the server accepts."""
 TILT = 1e-3
 """Tilt of the views from top and bottom, radians: the screen's upward direction needs one."""
 
@@ -104,10 +100,10 @@ class ViewControls:
         return origin + way * (self._camera.near / along) if along > 0.0 else origin
 
     def tick(self, now: float) -> None:
-        """Update the link; called by the page's clock."""
-        camera, chosen = self._camera, self._browser.chosen[:MOST_LINKED]
+        """Update the link, three times a second; called by the page's clock."""
+        camera, chosen = self._camera, self._browser.chosen[:50]  # as many as the server accepts
         seen = (tuple(camera.position), tuple(camera.look_at), camera.near, chosen)
-        if now - self._linked_at < LINK_EVERY or seen == self._linked:
+        if now - self._linked_at < 0.3 or seen == self._linked:
             return
         self._linked_at, self._linked = now, seen
         is_below = bool(self._browser.visitor.shown)  # the page's own address ends in "see/..."

@@ -1,7 +1,8 @@
 """View of one browser: visibility, highlights, colours, picking, distances."""
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -19,10 +20,8 @@ if TYPE_CHECKING:
     from viser import ClientHandle
 
 Floats = NDArray[np.float64]
-FLIGHT_S, FLIGHT_STEPS = 0.6, 18
-"""Duration of a camera motion, seconds, and its steps."""
-INK: Colour = (24, 32, 44)
-"""Colour of distance lines and labels."""
+FLIGHT_STEPS = 18
+"""Steps of a camera motion, in 0.6 s."""
 SHEER = 70
 """Opacity of see-through objects, 0 to 255."""
 
@@ -76,33 +75,33 @@ class BrowserScene:
 
     def show(self, ids: Iterable[int] | None = None) -> None:
         """Show objects; without ids show all, and end `isolate` and `see_through`."""
-        with self._contents.lock:
-            before, sheer = self.hidden, self._state.sheer
+        with self._changed() as state:
             if ids is None:
-                self._state.hidden, self._state.isolated, self._state.sheer = set(), None, set()
+                state.hidden, state.isolated, state.sheer = set(), None, set()
             else:
                 shown = set(ids)
-                self._state.hidden -= shown
-                if self._state.isolated is not None:
-                    self._state.isolated |= shown
-            self._draw((before ^ self.hidden) | (sheer ^ self._state.sheer))
-        self.shade()
+                state.hidden -= shown
+                if state.isolated is not None:
+                    state.isolated |= shown
 
     def hide(self, ids: Iterable[int]) -> None:
         """Hide objects in this browser, also from picking."""
-        with self._contents.lock:
-            hidden = set(ids)
-            self._state.hidden |= hidden
-            self._draw(hidden)
-        self.shade()
+        with self._changed() as state:
+            state.hidden |= set(ids)
 
     def isolate(self, ids: Iterable[int]) -> None:
         """Hide all other objects; `show` without ids ends it."""
+        with self._changed() as state:
+            state.isolated = frozenset(ids)
+            state.hidden -= state.isolated
+
+    @contextmanager
+    def _changed(self) -> Iterator[_ViewState]:
+        """Redraw the objects with another visibility after the block, and the shadow."""
         with self._contents.lock:
-            before = self.hidden
-            self._state.isolated = frozenset(ids)
-            self._state.hidden -= self._state.isolated
-            self._draw(before ^ self.hidden)
+            before, sheer = self.hidden, self._state.sheer
+            yield self._state
+            self._draw((before ^ self.hidden) | (sheer ^ self._state.sheer))
         self.shade()
 
     def shade(self) -> None:
@@ -157,7 +156,7 @@ class BrowserScene:
             eye, target = start + share * (np.stack([middle + offset, middle]) - start)
             with self._client.atomic():
                 camera.position, camera.look_at = eye, target
-            time.sleep(FLIGHT_S / FLIGHT_STEPS)
+            time.sleep(0.6 / FLIGHT_STEPS)
 
     def _draw(self, ids: Iterable[int]) -> None:
         with self._client.atomic():
@@ -174,24 +173,15 @@ class BrowserScene:
         scene = self._client.scene
         with self._client.atomic():
             scene.add_line_segments(
-                "/distance/line", ends[None] - ends[0], colors=INK, thickness=3.0,
+                "/distance/line", ends[None] - ends[0], colors=(24, 32, 44), thickness=3.0,
                 thickness_units="screen", position=ends[0],
             )  # fmt: skip
             scene.add_point_cloud(
-                "/distance/ends",
-                ends - ends[0],
-                colors=MARKED,
-                point_size=max(distance, 1e-9) * 0.02,
-                point_shape="circle",
-                precision="float32",
-                position=ends[0],
-            )
-            scene.add_label(
-                "/distance/label",
-                words,
-                position=tuple(ends.mean(axis=0)),
-                anchor="bottom-center",
-            )
+                "/distance/ends", ends - ends[0], colors=MARKED, point_shape="circle",
+                point_size=max(distance, 1e-9) * 0.02, precision="float32", position=ends[0],
+            )  # fmt: skip
+            middle = tuple(ends.mean(axis=0))
+            scene.add_label("/distance/label", words, position=middle, anchor="bottom-center")
 
     def clear_measure(self) -> None:
         """Remove the line and the label of `measure`."""

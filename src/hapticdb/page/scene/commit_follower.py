@@ -13,8 +13,6 @@ from hapticdb.store.base import Object
 
 POLL_EVERY_S = 0.02
 """Poll period, seconds."""
-TRY_AGAIN_S = 1.0
-"""Seconds from a failed statement to the next poll."""
 
 
 class Follower:
@@ -37,10 +35,10 @@ class Follower:
         self._thread.start()
         self._opened.result()
 
-    def close(self, timeout: float) -> None:
-        """Close the connection, and join the thread with a timeout, seconds."""
+    def close(self) -> None:
+        """Close the connection, and end the thread."""
         self._ended.set()
-        self._thread.join(timeout)
+        self._thread.join(10.0)
 
     def _run(self) -> None:
         try:
@@ -63,7 +61,7 @@ class Follower:
                     self._catch_up(env)
                 pause = POLL_EVERY_S
             except HapticDBError:
-                pause = TRY_AGAIN_S  # server unreachable: all objects are read again later
+                pause = 1.0  # server unreachable: all objects are read again later
                 self._revision = -1
 
     def _catch_up(self, env: Environment) -> None:

@@ -153,8 +153,7 @@ class Contents:
         """Add the audience of one browser."""
         with self.lock:
             self._audiences[key] = (audience, appearance)
-            for node in self._nodes():
-                self._sync(node, audience, appearance)
+            self.see(key, self._home)
 
     def leave(self, key: Hashable) -> None:
         """Remove a browser's audience."""
@@ -180,14 +179,10 @@ class Contents:
                 for audience, appearance in self._audiences.values():
                     self._sync(node, audience, appearance)
 
-    def _nodes(self) -> list[Node]:
-        return list({node.name: node for node in self._home.values()}.values())
-
     def _sync(self, node: Node, audience: Audience, appearance: Appearance) -> None:
         """Update an audience's scene nodes to its view of a node's objects."""
-        wanted: Mapping[str, Drawing | PointDrawing] = (
-            node.drawings(appearance) if node.members else {}
-        )
+        wanted: Mapping[str, Drawing | PointDrawing]
+        wanted = node.drawings(appearance) if node.members else {}
         # first in the dict, so `_shown` is new when the browsers are compared with it
         if audience is self._audiences[ALL][0]:
             before = self._shown.pop(node.name, {})

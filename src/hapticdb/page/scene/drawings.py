@@ -19,8 +19,6 @@ from hapticdb.page.scene.shapes import Dots
 if TYPE_CHECKING:
     from viser import BatchedMeshHandle, PointCloudHandle, SceneApi, SceneNodeHandle
 
-LEAST_SIMPLIFIED = 64
-"""Least number of vertices of a shape with levels of detail."""
 COARSER = ((14.0, 0.4), (45.0, 0.1))
 """Levels of detail: distance of the eye, in radii of the shape, and share of the triangles. At 14
 radii a shape fills a fifth of the picture's height."""
@@ -41,7 +39,7 @@ class Geometry:
 
     def coarser(self, n_vertices: int) -> tuple[tuple[float, float], ...] | str:
         """Levels of detail for viser: distances, metres, and shares of triangles."""
-        if n_vertices < LEAST_SIMPLIFIED:
+        if n_vertices < 64:
             return "off"
         return tuple((ratio * self.radius, share) for ratio, share in COARSER)
 
@@ -67,18 +65,11 @@ class Drawing:
 
     def equals(self, other: "Drawing | PointDrawing") -> bool:
         """Whether both are equal in the scene."""
+        arrays = ("sizes", "colours", "positions", "wxyzs")
         return (
             isinstance(other, Drawing)
             and self.key == other.key
-            and all(
-                np.array_equal(a, b)
-                for a, b in (
-                    (self.sizes, other.sizes),
-                    (self.colours, other.colours),
-                    (self.positions, other.positions),
-                    (self.wxyzs, other.wxyzs),
-                )
-            )
+            and all(np.array_equal(getattr(self, one), getattr(other, one)) for one in arrays)
         )
 
 
@@ -144,47 +135,27 @@ class Audience:
         self, name: str, drawing: Drawing | PointDrawing
     ) -> "BatchedMeshHandle | PointCloudHandle":
         if isinstance(drawing, PointDrawing):
-            return self._with_points(name, drawing)
+            points, colours, size = drawing.dots
+            return self._scene.add_point_cloud(
+                name, points, colours if drawing.colour is None else drawing.colour,
+                point_size=size, point_shape="circle", point_shading="flat", precision="float32",
+                wxyz=drawing.wxyz, position=drawing.position,
+            )  # fmt: skip
         vertices, faces = drawing.geometry.make()
         middle = drawing.positions.mean(axis=0)  # viser sends float32
         return self._scene.add_batched_meshes_simple(
-            name,
-            vertices,
-            faces,
-            drawing.wxyzs,
-            drawing.positions - middle,
-            batched_scales=drawing.sizes,
-            batched_colors=sent(drawing.colours),
+            name, vertices, faces, drawing.wxyzs, drawing.positions - middle,
+            batched_scales=drawing.sizes, batched_colors=sent(drawing.colours),
             lod=drawing.geometry.coarser(len(vertices)),  # type: ignore[arg-type]
-            opacity=drawing.geometry.opacity,
-            side="double",
-            cast_shadow=False,
-            receive_shadow=False,
-            position=middle,
-        )
-
-    def _with_points(self, name: str, drawing: PointDrawing) -> "PointCloudHandle":
-        points, colours, size = drawing.dots
-        return self._scene.add_point_cloud(
-            name,
-            points,
-            colours if drawing.colour is None else drawing.colour,
-            point_size=size,
-            point_shape="circle",
-            point_shading="flat",
-            precision="float32",
-            wxyz=drawing.wxyz,
-            position=drawing.position,
-        )
+            opacity=drawing.geometry.opacity, side="double", cast_shadow=False,
+            receive_shadow=False, position=middle,
+        )  # fmt: skip
 
     def blank(self, name: str) -> None:
         """Make a node empty, so that it hides the shared node of this name."""
-        if name in self._blanks:
-            return
-        there = self._meshes.pop(name, None)
-        if there is not None:
-            there[1].remove()
-        self._blanks[name] = self._scene.add_frame(name, show_axes=False, visible=False)
+        if name not in self._blanks:
+            self.drop(name)
+            self._blanks[name] = self._scene.add_frame(name, show_axes=False, visible=False)
 
     def drop(self, name: str) -> None:
         """Remove a node, if present; the shared node of this name shows again."""

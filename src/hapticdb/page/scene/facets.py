@@ -47,14 +47,10 @@ def sharpened(several: Sequence[Facets]) -> list[Facets]:
     points = _welded(vertices, np.repeat(np.arange(len(several)), n_vertices))[faces]
     corners = _smooth_pairs(vertices[faces], points)
     graph = coo_array((np.ones(len(corners), dtype=np.int8), corners.T), shape=(faces.size,) * 2)
-    n_found, found = connected_components(graph, directed=False)
-    # numbered in the order of corners: the vertices of each shape are contiguous
-    seen_first = np.empty(n_found, dtype=np.int64)
-    seen_first[found[::-1]] = np.arange(len(found))[::-1]  # the last write wins
-    order = np.empty(n_found, dtype=np.int64)
-    order[np.argsort(seen_first)] = np.arange(n_found)
-    label = order[found].reshape(-1, 3)
-    split = vertices[faces.reshape(-1)[np.sort(seen_first)]]
+    # scipy numbers components by their first corners: the vertices of each shape are contiguous
+    found = connected_components(graph, directed=False)[1].astype(np.int64)
+    label, first_corners = found.reshape(-1, 3), np.unique(found, return_index=True)[1]
+    split = vertices[faces.reshape(-1)[first_corners]]
     made, start, begin = [], 0, 0
     for facets in several:
         own = label[start : start + len(facets.faces)]
@@ -105,8 +101,9 @@ def _next_corner(corner: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def cube() -> Facets:
-    """Cube of edge 1 about the origin."""
-    return _quads(_CUBE[_SIDES])
+    """Cube of edge 1 about the origin, float32 and uint32."""
+    vertices, faces = _quads(_CUBE[_SIDES])
+    return Facets(vertices.astype(np.float32), faces.astype(np.uint32))
 
 
 def _quads(corners: NDArray[np.float64]) -> Facets:

@@ -7,20 +7,16 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.kernels import curves
 from hapticdb.page.colours import Colour, Rgba
 from hapticdb.page.scene.drawings import Drawing, Geometry, PointDrawing
 from hapticdb.page.scene.facets import Facets, cube
 from hapticdb.page.scene.shapes import Dots, PartShape, Piece
 from hapticdb.poses import quaternion_of
 
-LEAST_SAVED = 2_000
-"""Least number of triangles saved by an instanced node over merging."""
 MOST_MERGED = 24_000
 """Greatest number of triangles of a merged node with more than one object."""
-BOX_OPACITY = 0.3
-"""Opacity of the AABBs of objects without a shape yet."""
 _OPAQUE = 255
-_UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass
@@ -51,9 +47,8 @@ class BatchNode:
         self._slots = list(members)
         """Instances in order; a removed member is invisible, and its slot stays."""
         self._is_boxes = shape is None
-        self._geometries: list[tuple[Rgba | None, Geometry]] = [
-            (None, Geometry("box", _cube32, 0.87, BOX_OPACITY))
-        ]
+        self._geometries: list[tuple[Rgba | None, Geometry]]
+        self._geometries = [(None, Geometry("box", cube, 0.87, 0.3))]
         if shape is not None:
             self._geometries = [
                 (piece.colour, _geometry_of((shape.serial, n), piece, shape.radius))
@@ -131,11 +126,6 @@ def _opacity(colour: Rgba | None) -> float | None:
     return None if colour is None or colour[3] == _OPAQUE else colour[3] / _OPAQUE
 
 
-def _cube32() -> Facets:
-    vertices, faces = cube()
-    return Facets(vertices.astype(np.float32), faces.astype(np.uint32))
-
-
 class _MergedNode:
     """Different shapes, mostly of one colour, merged into one geometry.
 
@@ -182,7 +172,7 @@ class _MergedNode:
         make = partial(merged, pieces, self._center)
         return Drawing(
             Geometry(key, make, radius, _opacity(colour)),
-            _UNTURNED[None],
+            np.array([[1.0, 0.0, 0.0, 0.0]]),
             self._center[None],
             np.ones(1),
             np.array([colour[:3]], dtype=np.uint8),
@@ -224,8 +214,8 @@ def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
         if shape.dots is not None:
             nodes.extend(_CloudNode(names(), one, shape, shape.dots) for one in same)
             continue
-        saved = (len(same) - 1) * shape.n_triangles
-        if saved >= LEAST_SAVED or shape.n_triangles > MOST_MERGED:
+        saved = (len(same) - 1) * shape.n_triangles  # over merging
+        if saved >= 2_000 or shape.n_triangles > MOST_MERGED:
             nodes.append(BatchNode(names(), same, shape))
         else:
             for member in same:
@@ -242,7 +232,7 @@ def _runs(members: list[Member]) -> list[list[Member]]:
     size = max(float((centers - low).max()), 1e-12)
     steps = np.minimum((centers - low) / size * 1024, 1023).astype(np.int64)
     # along the Z-order neighbours in space are in one run
-    order = np.argsort(_interleaved(steps), kind="stable").tolist()
+    order = np.argsort(curves.encode(steps, 10, curves.Z_ORDER), kind="stable").tolist()
     runs: list[list[Member]] = []
     n_triangles = 0
     for index in order:
@@ -254,12 +244,3 @@ def _runs(members: list[Member]) -> list[list[Member]]:
         runs[-1].append(member)
         n_triangles += own
     return runs
-
-
-def _interleaved(steps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Z-order (n,) of steps (n, 3) below 1024."""
-    order = np.zeros(len(steps), dtype=np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            order |= ((steps[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return order

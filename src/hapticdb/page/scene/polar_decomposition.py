@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 SAME = 1e-7
 """Relative tolerance of equal stretches."""
-REMEMBERED = 1 << 14
-"""Placements in the cache, 1 kB each. Larger: faster in larger scenes."""
 
 
 class Placed(NamedTuple):
@@ -38,7 +36,7 @@ def decompose(transform: NDArray[np.float64]) -> Placed:
     return _decompose(np.asarray(transform, dtype=np.float64).tobytes())
 
 
-@lru_cache(maxsize=REMEMBERED)
+@lru_cache(maxsize=1 << 14)  # 1 kB each
 def _decompose(placement: bytes) -> Placed:
     transform = np.frombuffer(placement).reshape(4, 4)
     pose = np.eye(4)

@@ -1,7 +1,7 @@
 """Reader of the objects' shapes, in a thread of its own."""
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import monotonic
@@ -22,19 +22,12 @@ from hapticdb.store.connect import open_store
 
 ShapedObject = tuple[Object, PartShape, NDArray[np.float64]]
 """Object, its shape, and the shape's pose (4, 4), world_from_shape."""
-SHOW_EVERY_S = 0.5
-"""Greatest time between two updates of the scene, seconds."""
-SHOW_TRIANGLES = 1_000_000
-"""Triangles of an update, at which it is sent."""
-
-
 MOST_DOTS = 600_000
-"""Greatest number of drawn points of a cloud. Larger: more detail, 15 bytes each."""
+"""Greatest number of drawn points of a cloud, 15 bytes each."""
 CUBES = 1024
 """Cubes along a cloud's longest edge as its ray target, before `MOST_BLOCKS`."""
 MOST_BLOCKS = 6_000
-"""Greatest number of cubes of an object without a surface, and of a cloud's ray target. Larger:
-more detail, about 100 bytes each."""
+"""Greatest number of cubes of an object without a surface, and of a cloud's ray target."""
 
 
 class ShapeReader:
@@ -52,8 +45,8 @@ class ShapeReader:
         self._wanted: SimpleQueue[Sequence[Object] | None] = SimpleQueue()
         self._ended = Event()
         self._shapes: dict[tuple[str, bytes], PartShape] = {}
-        self._thread = Thread(target=self._run, name="shapes", daemon=True)
-        self._thread.start()
+        self.thread = Thread(target=self._run, name="shapes", daemon=True)
+        self.thread.start()
 
     def read(self, objects: Sequence[Object]) -> None:
         """Queue objects."""
@@ -64,10 +57,6 @@ class ShapeReader:
         self._ended.set()
         self._wanted.put(None)
 
-    def join(self, timeout: float) -> None:
-        """Join the thread, with a timeout in seconds."""
-        self._thread.join(timeout)
-
     def _run(self) -> None:
         while (objects := self._wanted.get()) is not None and not self._ended.is_set():
             self._read(objects)
@@ -77,24 +66,21 @@ class ShapeReader:
         ordered = sorted(objects, key=lambda obj: obj.digest)
         left = {obj.id: obj for obj in objects}
         ready: list[ShapedObject] = []
-        try:
-            with closing(open_store(self._url, read_only=True)) as store:
-                shown, n_triangles, digest = monotonic(), 0, ""
-                for obj, part in parts_of(store, ordered):
-                    if self._ended.is_set():
-                        return
-                    # never between equal parts, which are instances of one node
-                    if obj.digest != digest and (
-                        n_triangles > SHOW_TRIANGLES or monotonic() - shown > SHOW_EVERY_S
-                    ):
-                        self._show_drawn(ready)
-                        ready, shown, n_triangles = [], monotonic(), 0
-                    digest = obj.digest
-                    ready.append(self._shaped(obj, part))
-                    n_triangles += ready[-1][1].n_triangles
-                    del left[obj.id]
-        except HapticDBError:  # database unreachable or damaged: voxels for the others
-            pass
+        # database unreachable or damaged: voxels for the others
+        with suppress(HapticDBError), closing(open_store(self._url, read_only=True)) as store:
+            shown, n_triangles, digest = monotonic(), 0, ""
+            for obj, part in parts_of(store, ordered):
+                if self._ended.is_set():
+                    return
+                # never between equal parts, which are instances of one node
+                is_due = n_triangles > 1_000_000 or monotonic() - shown > 0.5
+                if obj.digest != digest and is_due:
+                    self._show_drawn(ready)
+                    ready, shown, n_triangles = [], monotonic(), 0
+                digest = obj.digest
+                ready.append(self._shaped(obj, part))
+                n_triangles += ready[-1][1].n_triangles
+                del left[obj.id]
         self._show_drawn(ready)
         self._lost(list(left.values()))
 

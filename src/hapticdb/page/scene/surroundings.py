@@ -21,19 +21,10 @@ TOWARDS = (0.62, 0.50, 0.42)
 ABOVE = (226, 231, 237)
 BELOW = (250, 251, 252)
 """Colours of the background, at the top and at the bottom of the picture."""
-AMBIENT = 0.5
-"""Ambient light, in addition to viser's default lights. Larger: brighter, flatter shadows."""
-LINE = (196, 202, 210)
-SECTION = (168, 176, 187)
-"""Colours of the ground's lines: all, and each tenth."""
-SHADOW = 0.45
-"""Opacity of the shadow under the middle of the objects."""
-SHADOW_EDGE, SHADOW_BLUR = 3.0, 0.05
-"""Edge of the shadow's image, and its blur (sigma), in radii of the scene."""
+SHADOW_EDGE = 3.0
+"""Edge of the shadow's image, in radii of the scene."""
 SHADOW_PIXELS = 192
-"""Pixels along that edge. More: a finer shadow, and more bytes."""
-GROUND_EDGE = 4.0
-"""Edge of the ground, in radii of the scene."""
+"""Pixels along that edge."""
 
 
 class View(NamedTuple):
@@ -59,7 +50,7 @@ def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -
     scene = server.scene
     scene.set_up_direction(tuple(np.eye(3)[up]))
     scene.configure_default_lights(enabled=True, cast_shadow=False)
-    scene.add_light_ambient("/light", intensity=AMBIENT)
+    scene.add_light_ambient("/light", intensity=0.5)
     scene.configure_environment_map(None)  # with one, 20 times slower without a GPU
     steps = np.linspace(0.0, 1.0, 64)[:, None, None]
     shades = (1 - steps) * np.array(ABOVE) + steps * np.array(BELOW)
@@ -87,22 +78,13 @@ def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
     # snapped to the tenth lines, which are then at round coordinates
     center = np.round(center / (10 * spacing)) * 10 * spacing
     center[up] = box[0, up]
-    edge = float(np.ceil(GROUND_EDGE * radius / spacing) * spacing)
+    edge = float(np.ceil(4.0 * radius / spacing) * spacing)
     scene.add_grid(
-        "/ground",
-        edge,
-        edge,
-        plane=PLANES[up],
-        cell_size=float(spacing),
-        section_size=float(10 * spacing),
-        cell_color=LINE,
-        section_color=SECTION,
-        cell_thickness=0.7,
-        section_thickness=1.0,
-        fade_distance=6 * radius,
-        fade_from="camera",
-        position=tuple(center),
-    )
+        "/ground", edge, edge, plane=PLANES[up], cell_size=float(spacing),
+        section_size=float(10 * spacing), cell_color=(196, 202, 210),
+        section_color=(168, 176, 187), cell_thickness=0.7, section_thickness=1.0,
+        fade_distance=6 * radius, fade_from="camera", position=tuple(center),
+    )  # fmt: skip
 
 
 def add_shadow(scene: "SceneApi", boxes: NDArray[np.float64], up: int, ground: float) -> None:
@@ -123,20 +105,13 @@ def add_shadow(scene: "SceneApi", boxes: NDArray[np.float64], up: int, ground: f
     covered = np.zeros((SHADOW_PIXELS, SHADOW_PIXELS))
     for (left, near), (right, far) in cells.tolist():
         covered[near : far + 1, left : right + 1] = 1.0
-    sigma = SHADOW_BLUR * SHADOW_PIXELS / SHADOW_EDGE
+    sigma = 0.05 * SHADOW_PIXELS / SHADOW_EDGE  # 0.05 radii
     image = np.zeros((SHADOW_PIXELS, SHADOW_PIXELS, 4), dtype=np.uint8)
-    image[..., 3] = np.round(255 * SHADOW * gaussian_filter(covered, sigma))
+    image[..., 3] = np.round(255 * 0.45 * gaussian_filter(covered, sigma))
     place = (low + high) / 2
     place[up] = ground - 1e-3 * radius
     turn = np.eye(3)[[*axes, up]].T
     scene.add_image(
-        "/shadow",
-        image,
-        edge,
-        edge,
-        format="png",
-        cast_shadow=False,
-        receive_shadow=False,
-        wxyz=quaternion_of(turn[None])[0],
-        position=tuple(place),
-    )
+        "/shadow", image, edge, edge, format="png", cast_shadow=False, receive_shadow=False,
+        wxyz=quaternion_of(turn[None])[0], position=tuple(place),
+    )  # fmt: skip

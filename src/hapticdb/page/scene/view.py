@@ -24,9 +24,6 @@ from hapticdb.store.base import Object
 if TYPE_CHECKING:
     from viser import ViserServer
 
-ENDS_WITHIN_S = 10.0
-"""Timeout for the end of each thread, seconds."""
-
 
 class SceneView:
     """Display of an environment's objects in all browsers of a viser server.
@@ -62,8 +59,8 @@ class SceneView:
         """End the threads and close the connection; the browsers' scenes stay."""
         self._is_closed.set()
         self._reader.close()
-        self._follower.close(ENDS_WITHIN_S)
-        self._reader.join(ENDS_WITHIN_S)
+        self._follower.close()
+        self._reader.thread.join(10.0)
 
     @property
     def grid(self) -> Grid:

@@ -194,6 +194,8 @@ def test_arrays_are_read(tmp_path: Path) -> None:
     assert np.allclose(read_poses(path), expected, atol=1e-15)
     np.save(path, [[1, 2, 3, *TURN]])
     assert np.allclose(read_poses(path, order="xyzw"), expected[1:], atol=1e-15)
+    with pytest.warns(UserWarning, match="all qw are 0"):
+        read_poses(path)
     for wrong, said in (
         (np.eye(4), "the shape"), (np.zeros((0, 7)), "no pose"),
         (np.zeros((1, 7)), "pose 0: the quaternion"), (np.array(["a"]), "<U1"),

@@ -29,10 +29,8 @@ from hapticdb.units import metres_of
 COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 FARTHEST = 1e9
-"""Largest coordinate of a position, metres. Larger: less likely positions are accepted."""
+"""Largest coordinate of a position, metres."""
 
-_UPRIGHT = 0.5
-"""Least scalar of a quaternion near the identity: turned by 120 degrees at most."""
 _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 
 Order = Literal["wxyz", "xyzw"]
@@ -117,13 +115,13 @@ def read_poses(
     if order not in {None, "wxyz", "xyzw"}:
         raise UsageError(f"order {order!r}: give wxyz or xyzw")
     is_array = Path(path).suffix.lower() == ".npy"
-    poses = _read_array(path, order or "wxyz") if is_array else poses_of(_read_rows(path, order))
+    poses = _read_array(path, order) if is_array else poses_of(_read_rows(path, order))
     if metres != 1.0:
         poses[:, :3, 3] *= metres
     return poses
 
 
-def _read_array(path: str | os.PathLike[str], order: Order) -> NDArray[np.float64]:
+def _read_array(path: str | os.PathLike[str], order: Order | None) -> NDArray[np.float64]:
     """Poses (M, 4, 4) of a .npy file; raises `FileError`."""
     try:
         found = as_floats(np.load(path, mmap_mode="c"), "poses")
@@ -136,10 +134,10 @@ def _read_array(path: str | os.PathLike[str], order: Order) -> NDArray[np.float6
         raise FileError(f"{path}: it has no pose")
     if found.ndim == 3:
         return found
-    names = [*"xyz", *(f"q{one}" for one in order)]
+    names = [*"xyz", *(f"q{one}" for one in order or "wxyz")]
     places = {name: names.index(name) for name in COLUMNS}
     rows = [_pose(row, places, f"{path}, pose {n}") for n, row in enumerate(found.tolist())]
-    return poses_of(np.array(rows))
+    return poses_of(_ordered(path, np.array(rows), order))
 
 
 def read_timed_poses(
@@ -228,14 +226,21 @@ def _read_rows(
         raise FileError(f"{path}, line {reader.line_num}: {error}; {_HINT}") from error
     if not rows:
         raise FileError(f"{path} holds no poses after its header; {_HINT}")
-    found = np.array(rows)
-    if order is None and (np.abs(found[:, 3]) < 1e-9).all() and abs(found[0, 6]) > _UPRIGHT:
+    return _ordered(path, np.array(rows), order)
+
+
+def _ordered(
+    path: str | os.PathLike[str], rows: NDArray[np.float64], order: Order | None
+) -> NDArray[np.float64]:
+    """Rows as given; a warning if their quaternions seem to be in another order."""
+    # a quaternion near the identity is turned by 120 degrees at most
+    if order is None and (np.abs(rows[:, 3]) < 1e-9).all() and abs(rows[0, 6]) > 0.5:
         warnings.warn(
             f"{path}: all qw are 0, and the first pose is half a turn from the identity: are the "
             "columns qx,qy,qz,qw? Then read_poses(order='xyzw') reads them",
-            stacklevel=3,
+            stacklevel=4,
         )
-    return found
+    return rows
 
 
 def _names_of(fields: list[str], order: Order | None) -> list[str]:

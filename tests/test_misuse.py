@@ -33,6 +33,8 @@ def test_an_id_of_another_type_or_that_no_object_has_is_refused(
         for one in (-1, 0, 2, 10**30):
             with pytest.raises(hapticdb.errors.ObjectNotFoundError, match=f"no object {one}"):
                 ask(one)
+    with pytest.raises(hapticdb.errors.UsageError, match="a word that selects one object"):
+        env.move(["ball"], np.eye(4))  # type: ignore[arg-type]
     with pytest.raises(hapticdb.errors.ObjectNotFoundError, match="no object 2"):
         env.touch(sphere, np.eye(4), exclude=[2])
     assert len(env.voxels(np.int64(1))) == env.object(1).voxels  # type: ignore[arg-type]

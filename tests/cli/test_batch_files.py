@@ -63,7 +63,8 @@ def test_what_does_not_fit_is_told_in_a_line(
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     np.save(mapped.with_name("flat.npy"), np.eye(4))
     mapped.with_name("text.npy").write_text("no array")
-    refused(run(*TOUCH, "path.csv", "--on", "cuda"), "--on", "without --out")
+    for word in ("cuda", "cpu"):
+        refused(run(*TOUCH, "path.csv", "--on", word), "--on", "without --out")
     refused(run(*TOUCH, "poses.npy", "--out", "f.npz", "--maxgap", 9), "--maxgap", "with --out")
     refused(run(*TOUCH, "poses.npy", "--out", "f.npz", "--csv", "-"), "--out", "--csv")
     refused(run(*TOUCH, "poses.npy", "--out", "f.xlsx"), "f.xlsx", ".parquet, .npz")

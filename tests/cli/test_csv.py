@@ -172,6 +172,10 @@ def test_a_full_disk_leaves_no_file(run: Run, scene: Path, monkeypatch: pytest.M
         ([*TOUCH, "--contacts-csv", "scene.db"], ["--contacts-csv 'scene.db'", "not there yet"]),
         ([*TOUCH, "--csv", ""], ["--csv", "not there yet"]),
         ([*TOUCH, "--csv", "nowhere/felt.csv"], ["nowhere/felt.csv", "No such file"]),
+        (
+            [*TOUCH, "--csv", "f.csv", "--contacts-csv", "f.csv"],
+            ["--contacts-csv", "another option"],
+        ),
         ([*TOUCH, "--csv", "-", "--json"], ["only one may be standard output"]),
         ([*TOUCH, "--csv", "-", "--contacts-csv", "-"], ["only one may be standard output"]),
         (["replay", "felt.hdbrec", "scene.db", "--csv", "-"], ["leave out URL, --json"]),

@@ -16,8 +16,6 @@ VENDORS = {
     "haply": ("hapticdb.devices.vendors.haply", "HaplyDevice"),
 }
 """Module and class of each commercial device, by its word."""
-RANDOM_SPEED = 0.3
-"""Default greatest speed of a random hand, m/s."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +65,7 @@ class HandOptions:
         from hapticdb.recording.file import Recording
 
         if self.at is not None:
-            greatest = RANDOM_SPEED if self.speed is None else self.speed
-            return scripted.RandomHand(self.at, seed, greatest)
+            return scripted.RandomHand(self.at, seed, 0.3 if self.speed is None else self.speed)
         word = self.device.lower()
         if word.endswith(".hdbrec"):
             times, poses = Recording(self.device).poses()

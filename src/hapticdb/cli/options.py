@@ -88,8 +88,8 @@ touch.strategy: How the database is asked.
 touch.maxgap KEYS: Widest gap that the strategy maxgap reads across, in voxel keys.
 touch.contacts_csv FILE: Write every contact as CSV to a new file; - is standard output.
 touch.out FILE: Feel all poses as a batch, and write a table to a new file: .csv, .parquet or .npz.
-touch.on cpu|cuda|ADDRESS: With --out, what computes: the processors, a GPU of NVIDIA, or workers of
-  dask.distributed, by their scheduler, tcp://host:8786.
+touch.on cpu|cuda|ADDRESS [cpu]: With --out, what computes: the processors, a GPU of NVIDIA, or
+  workers of dask.distributed, by their scheduler, tcp://host:8786.
 
 feel.device DEVICE: The hand: poses in a .csv (column t: seconds), a recording .hdbrec, random,
   force-dimension, openhaptics or haply.

@@ -197,6 +197,8 @@ class Environment(Queries, Closes):
             if len(found) > 1:
                 raise UsageError(f"move: {object_id!r} selects {len(found)} objects: give one")
             object_id = found[0].id
+        elif isinstance(object_id, Iterable):
+            raise UsageError(f"move: {object_id!r}: give one id, or a word that selects one object")
         move_object(self._store, self.object(object_id), transform, revision)
         self._forget()
         return self.object(object_id)

@@ -120,6 +120,8 @@ def new_file(target: Path, option: str, *, replaces: bool = False) -> Iterator[P
     if not target.name or (os.path.lexists(target) and not replaces):
         raise UsageError(f"{option} '{target}': give the name of a file that is not there yet")
     part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    if part.exists():
+        raise UsageError(f"{option} '{target}': another option names this file, too")
     try:
         part.touch(exist_ok=False)  # before the work: a folder may be missing
         yield part

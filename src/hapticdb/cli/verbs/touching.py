@@ -29,11 +29,6 @@ if TYPE_CHECKING:
     from hapticdb.query.touches import Touch
     from hapticdb.store.base import Object
 
-MOST_TOUCHED = 8
-"""Rows of the table of the objects touched in most frames."""
-FEW_POSES = 500
-"""Least poses of a path for a calibration of the database's costs. It takes most of a second, and
-its figures cannot be stored, since `touch` opens the environment read-only."""
 TOUCHED = ("pose", "force", "torque", "hits", "contacts", "deepest", "touched")
 """Keys of `touch --csv`: a row for each pose."""
 CONTACTS = ("pose", "point", "place", "depth", "id", "name")
@@ -44,7 +39,7 @@ CONTACTS = ("pose", "point", "place", "depth", "id", "name")
 class _Output(TableOutput):
     contacts_csv: str | None = None
     out: str | None = None
-    on: str = "cpu"
+    on: str | None = None
 
     def __post_init__(self) -> None:
         if self.out is not None:
@@ -103,7 +98,7 @@ def touch(
         shell = tool.made(env, name, found.excluded).shell
         which: dict[str, Any] = {"where": found.where, "exclude": found.exclude, "law": chosen}
         if output.out is not None:
-            pieces = env.touch_pieces(shell, path, on=output.on, **which)
+            pieces = env.touch_pieces(shell, path, on=output.on or "cpu", **which)
             _touch_into(Path(output.out), shell, pieces)
             return
         used = _strategy_of(query.strategy, env, len(path))
@@ -141,12 +136,14 @@ def _touch_into(
 
 
 def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
-    """Strategy of the queries: `array` instead of `auto` on a short path without stored costs."""
+    """Strategy of the queries: `array` instead of `auto` on a short path without stored costs.
+
+    A calibration takes most of a second, and `touch`, which only reads, cannot store it.
+    """
     from hapticdb.paper.cost_model import machine_name
 
-    if wanted == "auto" and n_poses < FEW_POSES and not env.store.costs(machine_name()):
-        return "array"
-    return wanted
+    is_short = n_poses < 500 and not env.store.costs(machine_name())
+    return "array" if wanted == "auto" and is_short else wanted
 
 
 def _record(touched: "Touch") -> dict[str, Any]:
@@ -220,5 +217,5 @@ class _Summary:
             ("objects", f"{len(self.objects)} touched"),
         ])  # fmt: skip
         ranked = sorted(self.frames_of.items(), key=lambda item: (-item[1], item[0]))
-        rows = ((i, self.objects[i].name, n) for i, n in ranked[:MOST_TOUCHED])
+        rows = ((i, self.objects[i].name, n) for i, n in ranked[:8])
         render.table(("id>", "touched most", "frames>"), rows)

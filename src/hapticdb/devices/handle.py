@@ -30,21 +30,12 @@ class Handle:
     on from its pose. After a reading that is not finite, or beyond 1e9 m, m/s or rad/s, the handle
     has no pose (its x is NaN) until the next valid reading. A handle has the state of one session.
 
-    Parameters
-    ----------
-    scale : float
-        S, metres of the scene for one metre of the device. Turns and forces are not scaled; a
-        torque at the device is the scene's over S, and stiffness is the device's at every scale.
-    start : array_like or None
-        Pose (4, 4) or point (3,) of the handle at the start, scene metres. None: the hand's pose,
-        its position scaled.
-    clutch : int or None
-        Number of the button that opens the clutch while pressed; None: no clutch.
+    scale : S, metres of the scene for one metre of the device. Turns and forces are not scaled; a
+    torque at the device is the scene's over S, and stiffness is the device's at every scale.
+    start : pose (4, 4) or point (3,) of the handle at the start, scene metres; the hand's pose, its
+    position scaled, unless given. clutch : button that opens the clutch while pressed.
 
-    Raises
-    ------
-    UsageError
-        If a number is out of its range or the start is no rigid transform.
+    Raises `UsageError` if a number is out of its range or the start is no rigid transform.
     """
 
     def __init__(

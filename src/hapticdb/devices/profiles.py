@@ -12,11 +12,9 @@ from typing import Protocol, runtime_checkable
 from hapticdb.errors import UsageError
 
 LIGHTEST = 0.045
-"""Mass, kg, assumed for a device of unknown mass: that of the lightest device of the table. Larger:
-stiffer springs are allowed on such devices, with more risk."""
+"""Mass, kg, assumed for a device of unknown mass: that of the lightest device of the table."""
 HAND_CAP = 7.0
-"""Cap, N, of scripted and simulated hands: that of a desktop device. Larger: their sessions reach
-deeper, with forces beyond any desktop device."""
+"""Cap, N, of scripted and simulated hands: that of a desktop device."""
 HAND_STIFFNESS = 1000.0
 """Default stiffness, N/m, of a session with a scripted or simulated hand."""
 STIFFEST = 1e6
@@ -25,52 +23,32 @@ STIFFEST = 1e6
 
 @dataclass(frozen=True)
 class DeviceProfile:
-    """Rendering limits of a device, in its own metres and newtons.
+    """Rendering limits of a device, in its own metres and newtons; None: not known.
 
-    Attributes
-    ----------
-    name : str
-        The device's name, for messages.
-    cap : float
-        Greatest force of its motors, N.
-    stiffness : float
-        Stiffest rendered spring, N/m.
-    damping : float
-        Strongest rendered damper, N s/m: commanded by the loop, without the device's own friction.
-    mass : float or None
-        Apparent mass at its tip, kg. None: not known.
-    own_damping : float
-        Damping of the device's own mechanics, N s/m. 0: not known.
-    hand_damping : float or None
-        Damping of the hand that holds the device, N s/m. None: a person's, in a light grip.
-        Infinite: no force moves this hand, so any spring is stable.
-    usual_stiffness : float or None
-        Default stiffness of a session, N/m. None: `stiffness`.
-    torque_cap : float or None
-        Greatest torque of its motors, N m. None: not known; see `hapticdb.session.coupling`.
-    turn_stiffness : float or None
-        Stiffest rotational spring, N m/rad. None: not known.
-    delay : float or None
-        Seconds from reading a pose until the corresponding force acts, without the period of the
-        loop. None: not known.
-
-    Raises
-    ------
-    UsageError
-        If a number is out of its range.
+    Raises `UsageError` if a number is out of its range.
     """
 
     name: str
     cap: float
+    """Greatest force of its motors, N."""
     stiffness: float
+    """Stiffest rendered spring, N/m."""
     damping: float
+    """Strongest rendered damper, N s/m: by the loop, without the device's own friction."""
     mass: float | None = None
+    """Apparent mass at its tip, kg."""
     own_damping: float = 0.0
+    """Damping of its own mechanics, N s/m; 0 if not known."""
     hand_damping: float | None = None
+    """Damping of the hand, N s/m; None for a person's light grip, infinite for a scripted hand."""
     usual_stiffness: float | None = None
+    """Default stiffness of a session, N/m; None for `stiffness`."""
     torque_cap: float | None = None
+    """Greatest torque of its motors, N m; see `hapticdb.session.coupling`."""
     turn_stiffness: float | None = None
+    """Stiffest rotational spring, N m/rad."""
     delay: float | None = None
+    """Seconds from reading a pose until its force acts, without the period of the loop."""
 
     def __post_init__(self) -> None:
         above = ("cap", "stiffness", "mass", "usual_stiffness", "torque_cap", "turn_stiffness")
@@ -112,14 +90,9 @@ PROFILES = {
 UNKNOWN = DeviceProfile("unknown", HAND_CAP, 1000.0, 5.0)
 """Profile of a device without one: common limits of desktop devices."""
 SCRIPTED = DeviceProfile(
-    "scripted",
-    HAND_CAP,
-    STIFFEST,
-    STIFFEST,
-    hand_damping=math.inf,
-    usual_stiffness=HAND_STIFFNESS,
-    delay=0.0,
-)
+    "scripted", HAND_CAP, STIFFEST, STIFFEST, hand_damping=math.inf,
+    usual_stiffness=HAND_STIFFNESS, delay=0.0,
+)  # fmt: skip
 """Profile of a scripted hand: no force moves it."""
 
 
@@ -133,13 +106,7 @@ class _SupportsProfile(Protocol):
 
 
 def profile_of(device: object) -> DeviceProfile:
-    """Profile of a device; `UNKNOWN` for a device without one.
-
-    Raises
-    ------
-    UsageError
-        If the device's profile is no `DeviceProfile`.
-    """
+    """Profile of a device; `UNKNOWN` without one; UsageError unless it is a `DeviceProfile`."""
     if not isinstance(device, _SupportsProfile):
         return UNKNOWN
     profile = device.profile
@@ -152,13 +119,7 @@ def profile_of(device: object) -> DeviceProfile:
 
 
 def profile_named(name: str) -> DeviceProfile:
-    """Profile of a device by its name; case and spaces do not matter.
-
-    Raises
-    ------
-    UsageError
-        If no device of the table has that name.
-    """
+    """Profile by the name of a device, in any case; UsageError for an unknown one."""
     word = "-".join(name.lower().split())
     if word not in PROFILES:
         raise UsageError(f"no device profile {name!r}: give {', '.join(PROFILES)}")

@@ -22,8 +22,7 @@ from hapticdb.kernels.hand.handle_motion import FARTHEST, is_valid_pose
 
 SKEW = 1e-3
 """Greatest error of the dot products of a rotation's columns, 0 or 1 when exact. Rounding to single
-precision and drift stay below it, a scaled rotation does not. Larger: less exact poses are
-accepted."""
+precision and drift stay below it, a scaled rotation does not."""
 MOST_BUTTONS = (1 << 31) - 1
 """Greatest mask of buttons: 31 bits, as a recording stores them."""
 DOUBLE = np.dtype(np.float64)
@@ -110,17 +109,12 @@ class Reader:
     def read(self) -> Reading:
         """Return the device's reading; its pose is NaN if it was no rigid transform.
 
-        Raises
-        ------
-        DeviceError
-            If the device raises it, or if the reading is of the wrong kind.
+        Raises `DeviceError` if the device does, or if the reading is of the wrong kind.
         """
         reading = self.device.read()
         if type(reading) is not Reading:
-            raise self._refused(
-                f"{_kind_of(reading)}",
-                "a hapticdb.devices.protocol.Reading(pose, velocity, buttons)",
-            )
+            form = "a hapticdb.devices.protocol.Reading(pose, velocity, buttons)"
+            raise self._refused(_kind_of(reading), form)
         pose, velocity, buttons = reading
         if not (
             type(pose) is np.ndarray
@@ -210,13 +204,7 @@ def _is_rigid_enough(pose: NDArray[np.float64]) -> bool:
 
 
 def check_device(device: object) -> None:
-    """Refuse an object that is no device, with a hint at the class to pass instead.
-
-    Raises
-    ------
-    UsageError
-        If the object lacks `read` or `apply`, or is a class.
-    """
+    """UsageError for an object without `read` or `apply`, or a class; hints at what to pass."""
     if isinstance(device, type):
         raise UsageError(
             f"device: {device.__name__} is a class; pass one that is made, as by ...()"

@@ -21,13 +21,6 @@ from hapticdb.poses import quaternion_of, read_timed_poses
 Clock = Callable[[], float]
 """Seconds since some fixed instant, monotonic."""
 
-LEVER = 0.1
-"""Lever arm, metres. Along a path with a speed, a turn counts as the arc length of a point at this
-distance from the origin. Larger: turns take longer."""
-
-PATH_SPEED = 0.1
-"""Default speed along a path without times, m/s."""
-
 CYCLE = 20.0
 """Period of `RandomHand`, s; its frequencies are multiples of 1 / CYCLE."""
 
@@ -102,27 +95,15 @@ class _Scripted:
 class Player(_Scripted):
     """A hand that follows timed poses, interpolated linearly, rotations by slerp.
 
-    Parameters
-    ----------
-    times : array_like
-        (M,) seconds, increasing; the first time is the instant of the first read.
-    poses : array_like
-        (M, 4, 4) rigid transforms, metres. Their differences give the velocity.
-    loops : bool
-        Start again at the end; for a smooth return, the path must end at its start. Otherwise the
-        hand rests at the last pose.
-    clock : callable
-        Time in seconds; must be picklable.
+    times (M,) : seconds, increasing; the first is the instant of the first read; poses (M, 4, 4) :
+    rigid, metres; their differences give the velocity; loops : start again at the end, smoothly if
+    the path ends at its start, instead of a rest there; clock : seconds, picklable.
     """
 
     def __init__(
-        self,
-        times: ArrayLike,
-        poses: ArrayLike,
-        *,
-        loops: bool = False,
+        self, times: ArrayLike, poses: ArrayLike, *, loops: bool = False,
         clock: Clock = time.perf_counter,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(clock)
         when = np.array(times, dtype=np.float64)
         where = np.array(poses, dtype=np.float64)
@@ -154,32 +135,19 @@ class Player(_Scripted):
 class Path(Player):
     """A hand that follows the poses of a file (`hapticdb.read_poses`).
 
-    Parameters
-    ----------
-    path : path
-        The file. Its column ``t``, if it has one, gives the times (s) unless `speed` is given.
-    speed : float, optional
-        Metres a second; 0.1 if the file gives no time. A turn counts as the arc length of a point
-        0.1 m from the origin; successive equal poses count once.
-    loops, clock
-        As for `Player`.
+    path : with times in a column ``t``, used unless `speed` is given; speed : metres a second; 0.1
+    if the file gives no time. A turn counts as the arc length of a point 0.1 m from the origin;
+    successive equal poses count once. loops, clock : as for `Player`.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
+    Raises `FileError` if the file cannot be read.
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        speed: float | None = None,
-        loops: bool = False,
+        self, path: str | os.PathLike[str], *, speed: float | None = None, loops: bool = False,
         clock: Clock = time.perf_counter,
-    ) -> None:
+    ) -> None:  # fmt: skip
         times, poses = read_timed_poses(path)
-        self.assumed_speed = PATH_SPEED if times is None and speed is None else None
+        self.assumed_speed = 0.1 if times is None and speed is None else None
         """Assumed speed, m/s, without times in the file and without `speed`; else None."""
         if times is None or speed is not None:
             times, poses = _times_at(poses, _positive("speed", self.assumed_speed or speed or 0.0))
@@ -197,7 +165,7 @@ def _times_at(
     )
     turns = 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
     moves = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    lengths = np.maximum(moves, LEVER * turns)
+    lengths = np.maximum(moves, 0.1 * turns)  # lever of 0.1 m
     kept = np.concatenate([[True], lengths > 1e-12])
     return np.concatenate([[0.0], np.cumsum(lengths[kept[1:]])]) / speed, poses[kept]
 
@@ -209,43 +177,21 @@ class RandomHand(_Scripted):
     frequencies are multiples of one, and the motion repeats after 20 s. It starts at the center.
     Slow waves that would carry the hand beyond its reach are omitted.
 
-    Parameters
-    ----------
-    center : array_like
-        Point (3,) or pose (4, 4), metres.
-    seed : int
-        Seed of the random motion.
-    speed, angular_speed : float
-        Greatest speeds in a cycle, m/s and rad/s, exact to 0.1 %.
-    reach : float
-        Greatest distance from the center, metres.
-    clock
-        As for `Player`.
+    center : point (3,) or pose (4, 4), metres; speed, angular_speed : greatest ones in a cycle, m/s
+    and rad/s, exact to 0.1 %; reach : greatest distance from the center, metres; clock : as for
+    `Player`.
 
-    Raises
-    ------
-    UsageError
-        If no motion below 8 Hz is that fast within the reach.
+    Raises `UsageError` if no motion below 8 Hz is that fast within the reach.
     """
 
     def __init__(
-        self,
-        center: ArrayLike,
-        seed: int = 0,
-        speed: float = 0.3,
-        angular_speed: float = 1.5,
-        reach: float = 0.3,
-        *,
-        clock: Clock = time.perf_counter,
-    ) -> None:
+        self, center: ArrayLike, seed: int = 0, speed: float = 0.3, angular_speed: float = 1.5,
+        reach: float = 0.3, *, clock: Clock = time.perf_counter,
+    ) -> None:  # fmt: skip
         super().__init__(clock)
         self._center = pose_at(center)
-        self._waves = _random_waves(
-            seed,
-            _positive("speed", speed),
-            _positive("angular_speed", angular_speed),
-            _positive("reach", reach),
-        )
+        given = {"speed": speed, "angular_speed": angular_speed, "reach": reach}
+        self._waves = _random_waves(seed, *(_positive(name, n) for name, n in given.items()))
 
     def read(self) -> Reading:
         """Pose and velocity now."""

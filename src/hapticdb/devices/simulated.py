@@ -27,8 +27,6 @@ STEP = 1e-4
 
 INERTIA, TURN_GRIP, MAX_TORQUE = 1e-4, 1e-3, 0.2
 """Moment of inertia, kg m^2; rotational stiffness of a grip, N m/rad per N/m; torque cap, N m."""
-LEAST_CAP = 1e-6
-"""Cap, N, in the profile of a device without motors. Smaller: contacts become softer."""
 LONGEST = 0.05
 """Longest time, s, that one read integrates; after a longer pause the time before is skipped."""
 
@@ -40,39 +38,19 @@ class SimulatedDevice:
     and the device x. Rotations follow the same law. The integration has fixed steps of 0.1 ms; the
     pose is extrapolated from the last step to the instant of the read.
 
-    Parameters
-    ----------
-    hand : Device
-        Intended motion of the device, as readings.
-    mass : float
-        Mass of the device, kg. Its moment of inertia is 1e-4 kg m^2 about every axis.
-    grip : float
-        Stiffness of the hand, N/m; for rotations a thousandth of it, N m/rad.
-    max_force : float
-        Greatest force of the motors, N; their greatest torque is 0.2 N m. Longer wrenches are
-        shortened.
-    latency : float
-        Seconds from `apply` until the motors push.
-    clock : callable
-        Time in seconds; must be picklable, and should be the hand's clock.
+    hand : intended motion of the device, as readings; mass : of the device, kg, its moment of
+    inertia is 1e-4 kg m^2 about every axis; grip : stiffness of the hand, N/m, for rotations a
+    thousandth of it, N m/rad; max_force : of the motors, N, their greatest torque is 0.2 N m;
+    latency : seconds from `apply` until the motors push; clock : seconds, picklable, the hand's.
 
-    Raises
-    ------
-    UsageError
-        If a number is out of its range, the grip is too stiff for steps of 0.1 ms, or the hand is
-        no device.
+    Raises `UsageError` if a number is out of its range, the grip is too stiff for steps of 0.1 ms,
+    or the hand is no device.
     """
 
     def __init__(
-        self,
-        hand: Device,
-        *,
-        mass: float = 0.1,
-        grip: float = 300.0,
-        max_force: float = HAND_CAP,
-        latency: float = 1e-3,
-        clock: Clock = time.perf_counter,
-    ) -> None:
+        self, hand: Device, *, mass: float = 0.1, grip: float = 300.0, max_force: float = HAND_CAP,
+        latency: float = 1e-3, clock: Clock = time.perf_counter,
+    ) -> None:  # fmt: skip
         numbers = (mass, grip, max_force, latency)
         if not all(math.isfinite(n) and n >= 0.0 for n in numbers) or mass <= 0.0:
             raise UsageError("a simulated device takes numbers that are not negative, and a mass")
@@ -95,17 +73,12 @@ class SimulatedDevice:
     def profile(self) -> DeviceProfile:
         """Caps, mass and delay of the device; the damping of its hand is that of the grip."""
         mass, grip = self._inertias[0], self._grips[0]
+        least = 1e-6  # cap of a device without motors
         return DeviceProfile(
-            "simulated",
-            max(self.max_force, LEAST_CAP),
-            STIFFEST,
-            STIFFEST,
-            mass=mass,
-            hand_damping=2.0 * math.sqrt(grip * mass),
-            usual_stiffness=HAND_STIFFNESS,
-            torque_cap=MAX_TORQUE,
-            delay=self.latency,
-        )
+            "simulated", max(self.max_force, least), STIFFEST, STIFFEST, mass=mass,
+            hand_damping=2.0 * math.sqrt(grip * mass), usual_stiffness=HAND_STIFFNESS,
+            torque_cap=MAX_TORQUE, delay=self.latency,
+        )  # fmt: skip
 
     @property
     def is_over(self) -> bool:
@@ -157,16 +130,6 @@ class SimulatedDevice:
         ahead = now - self._time
         self._time += n_steps * STEP
         pull(
-            n_steps,
-            STEP,
-            ahead,
-            max(0.0, now - self._time),
-            hand.pose,
-            hand.velocity,
-            self._pushing,
-            self._inertias,
-            self._grips,
-            self._body,
-            self._pose,
-            self._velocity,
-        )
+            n_steps, STEP, ahead, max(0.0, now - self._time), hand.pose, hand.velocity,
+            self._pushing, self._inertias, self._grips, self._body, self._pose, self._velocity,
+        )  # fmt: skip

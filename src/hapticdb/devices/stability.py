@@ -13,28 +13,16 @@ from hapticdb.errors import UsageError
 
 SHARE = 0.4
 """Used share of the bound of Gil and others. Measured limits were 0.42 to 0.60 of the bound for a
-light grip and 0.88 to 1.02 for a firm one. Larger: stiffer surfaces, which tremble in a light
-grip."""
-GRIP_STIFFNESS = 100.0
-"""Stiffness of a light grip, N/m. Larger: more damping is expected of the hand."""
-GRIP_DAMPING = 0.6
-"""Damping of a light grip, in sqrt(stiffness times mass): 0.3 of critical. Larger: likewise."""
+light grip and 0.88 to 1.02 for a firm one."""
 SMALLEST = 1.0
 """Least stiffness of a session, N/m: a softer one is imperceptible."""
 
 
 @dataclass(frozen=True)
 class _Allowance:
-    """Stiffness granted to a session, and the reason if it was lowered.
+    """Requested and granted stiffness of a session, N/m; delay in the stability rule, s.
 
-    Attributes
-    ----------
-    requested, stiffness : float
-        Requested and granted stiffness, N/m.
-    delay : float
-        Delay in the stability rule, s.
-    lowered : str or None
-        One line: the limit that lowered the stiffness; None if none did.
+    lowered : one line on the limit that lowered the stiffness; None if none did.
     """
 
     requested: float
@@ -46,13 +34,13 @@ class _Allowance:
 def hand_damping(profile: DeviceProfile) -> float:
     """Damping of the hand on the device, N s/m.
 
-    That of a light grip, b = 0.6 sqrt(100 m), unless the profile states it. For an unknown mass m,
-    the lightest device's is assumed.
+    That of a light grip, b = 0.6 sqrt(100 m), 0.3 of critical, unless the profile states it. For an
+    unknown mass m, the lightest device's is assumed.
     """
     if profile.hand_damping is not None:
         return profile.hand_damping
     mass = LIGHTEST if profile.mass is None else profile.mass
-    return GRIP_DAMPING * math.sqrt(GRIP_STIFFNESS * mass)
+    return 0.6 * math.sqrt(100.0 * mass)
 
 
 def delay_of(profile: DeviceProfile, rate: float, delay: float | None = None) -> float:
@@ -75,21 +63,8 @@ def limit_stiffness(
 ) -> _Allowance:
     """Limit a stiffness to the device's greatest and to the stable one.
 
-    Parameters
-    ----------
-    profile : DeviceProfile
-        The device.
-    rate : float
-        Frames a second.
-    requested : float or None
-        Stiffness at the device, N/m. None: the profile's.
-    delay : float or None
-        Seconds; None: see `delay_of`.
-
-    Raises
-    ------
-    UsageError
-        If the stiffness is not a number of `SMALLEST` or more.
+    rate : frames a second; requested : N/m at the device, None for the profile's; delay : as for
+    `delay_of`. UsageError unless the stiffness is a number of `SMALLEST` or more.
     """
     wanted = profile.first_stiffness if requested is None else requested
     if not (math.isfinite(wanted) and wanted >= SMALLEST):

@@ -20,12 +20,7 @@ WINDOW = 0.02
 def load(module: str, extra: str) -> ModuleType:
     """Import the driver module of a device.
 
-    Raises
-    ------
-    MissingExtraError
-        If its package is not installed.
-    DeviceError
-        If the package is installed, but not the vendor's own library that it calls.
+    Raises `MissingExtraError` without its package, `DeviceError` without the vendor's own library.
     """
     try:
         return importlib.import_module(module)

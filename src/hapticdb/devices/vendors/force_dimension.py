@@ -19,8 +19,6 @@ from hapticdb.errors import DeviceError
 
 TIMEOUT = 7
 """ErrorNum.TIMEOUT: the velocity estimator does not have two positions yet."""
-TORQUE_CAP = 0.2
-"""Cap, N m, of a device whose profile gives none."""
 PROFILE = DeviceProfile("force-dimension", cap=7.0, stiffness=3000.0, damping=20.0)
 """Profile of an unspecified model: limits within those of every model."""
 
@@ -30,17 +28,13 @@ class ForceDimensionDevice:
 
     Without a wrist its rotation is the identity; without motors in the wrist the torque is ignored.
 
-    Parameters
-    ----------
-    serial : int, optional
-        Serial number; the first free device unless given.
-    profile : DeviceProfile
-        The model's profile, as of `hapticdb.devices.profiles.PROFILES`.
+    serial : number; the first free device unless given; profile : the model's, as of
+    `hapticdb.devices.profiles.PROFILES`.
     """
 
     def __init__(self, serial: int | None = None, *, profile: DeviceProfile = PROFILE) -> None:
         self.serial = serial
-        self._torque_cap = profile.torque_cap or TORQUE_CAP
+        self._torque_cap = profile.torque_cap or 0.2
         self.profile = replace(profile, torque_cap=self._torque_cap)
         self._dhd: Any = None
         self._id = -1

@@ -31,9 +31,6 @@ LOOPBACK = {"localhost", "127.0.0.1", "::1"}
 SILENCE = 0.1
 """Longest time to an answer, s; then the device counts as lost."""
 
-HANDSHAKE = {"configure": {"profile": {"name": "hapticdb"}}}
-"""Session part of the first message: the name of the profile."""
-
 AXES = ("x", "y", "z")
 
 
@@ -44,19 +41,10 @@ PROFILE = DeviceProfile("inverse3", cap=7.0, stiffness=1000.0, damping=5.0)
 class HaplyDevice:
     """A device of Haply.
 
-    Parameters
-    ----------
-    device_id : str, optional
-        The service's name of the device ("049D"); the first device unless given.
-    url : str
-        The service's address, on this machine.
-    profile : DeviceProfile
-        Limits of the device; an Inverse3's unless given.
+    device_id : the service's name of the device ("049D"), the first one unless given; url : of the
+    service, on this machine; profile : of the device, an Inverse3's unless given.
 
-    Raises
-    ------
-    UsageError
-        If the address is of another machine.
+    Raises `UsageError` if the address is of another machine.
     """
 
     def __init__(
@@ -85,13 +73,9 @@ class HaplyDevice:
             # every message is answered within the period, so no pings; the service is local, so no
             # proxy
             connection = client.connect(
-                self.url,
-                open_timeout=2.0,
-                close_timeout=0.5,
-                ping_interval=None,
-                compression=None,
-                proxy=None,
-            )
+                self.url, open_timeout=2.0, close_timeout=0.5, ping_interval=None,
+                compression=None, proxy=None,
+            )  # fmt: skip
             self._socket = self._held.enter_context(connection)
         except (OSError, self._exceptions.WebSocketException) as error:
             raise DeviceError(
@@ -100,7 +84,8 @@ class HaplyDevice:
         try:
             self._id = self._find()
             self._window = VelocityWindow()
-            self._send([0.0, 0.0, 0.0], session=HANDSHAKE)
+            named = {"configure": {"profile": {"name": "hapticdb"}}}
+            self._send([0.0, 0.0, 0.0], session=named)
         except DeviceError:
             self.close()
             raise

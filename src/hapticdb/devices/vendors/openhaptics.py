@@ -35,23 +35,14 @@ force for ever if the loop stopped."""
 class OpenHapticsDevice:
     """A device of 3D Systems; its frame is that of OpenHaptics: x right, y up, z towards the user.
 
-    Parameters
-    ----------
-    name : str
-        Name of the device in the vendor's setup.
-    profile : DeviceProfile
-        The model's profile, as of `hapticdb.devices.profiles.PROFILES`; a Touch unless given.
-    clock : callable
-        Returns seconds; it must be picklable.
+    name : of the device in the vendor's setup; profile : the model's, as of
+    `hapticdb.devices.profiles.PROFILES`, a Touch unless given; clock : seconds, picklable.
     """
 
     def __init__(
-        self,
-        name: str = "Default Device",
-        *,
-        profile: DeviceProfile = PROFILES["touch"],
+        self, name: str = "Default Device", *, profile: DeviceProfile = PROFILES["touch"],
         clock: Clock = time.perf_counter,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name = name
         self.profile = profile
         self.clock = clock

@@ -1,6 +1,5 @@
 """The page lets in the connections of its server, and nobody else."""
 
-import json
 import socket
 from collections.abc import Iterator
 from contextlib import suppress
@@ -19,11 +18,13 @@ from hapticdb.page.connection import (
     LONGEST_WORDS,
     MOST_FAILED,
     NAME,
+    PING,
+    PONG,
+    REFUSED,
     ROLE,
     SECRET,
     PageConnection,
     Visitor,
-    line,
 )
 from serving import CAMERA, PROTOCOL, close_code, sent
 
@@ -64,20 +65,19 @@ def entered(page: Page, role: str) -> ClientConnection:
     return reached(page, {SECRET: "the secret", NAME: "Guest 1", ROLE: role})
 
 
-def said(ours: socket.socket) -> dict[str, object]:
+def said(ours: socket.socket) -> bytes:
     received = b""
     while not received.endswith(b"\n"):
         received += ours.recv(1)
-    found: dict[str, object] = json.loads(received)
-    return found
+    return received
 
 
 def test_a_connection_with_the_secret_is_let_in_under_its_name(page: Page) -> None:
     with entered(page, "toucher") as browser:
         assert browser.recv(timeout=TIMEOUT)
         assert page.link.visitor(0) == Visitor("Guest 1", "toucher")
-        page.ours.sendall(line("ping"))
-        assert said(page.ours)["word"] == "pong"
+        page.ours.sendall(PING)
+        assert said(page.ours) == PONG
     until(lambda: 0 not in page.link._live)
 
 
@@ -102,7 +102,7 @@ def test_whoever_lacks_the_secret_is_sent_away_with_nothing(
             browser.recv(timeout=TIMEOUT)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == LATE
-    assert said(page.ours)["word"] == "refused"
+    assert said(page.ours) == REFUSED
     assert page.server.get_clients() == {}
 
 

@@ -4,12 +4,11 @@ The page listens on a port of the loopback interface, open to every user of the 
 server makes a secret for each page process and sends it in a header of each connection, along with
 the browser's name and role. The page closes every connection without it.
 
-Messages are lines of JSON on an inherited socket pair: ``ping``, ``pong``, ``refused``.
+Messages are words on an inherited socket pair, a line each.
 """
 
 import contextlib
 import hmac
-import json
 import logging
 import socket
 import threading
@@ -28,8 +27,8 @@ SECRET, NAME, ROLE, SHOWN = (f"hapticdb-{word}" for word in ("secret", "name", "
 """Headers of the server's connections to the page."""
 ROLES = ("viewer", "toucher", "editor")
 """Roles; each includes the rights of those before it: to view, to touch, to move parts."""
-LONGEST_LINE = 4096
-"""Greatest length of a message, bytes."""
+PING, PONG, REFUSED = b"ping\n", b"pong\n", b"refused\n"
+"""The server's question and its answer; a connection without the secret."""
 LONGEST_WORDS = 200
 """Characters of a viser error in the log."""
 LATE = 1013
@@ -37,8 +36,7 @@ LATE = 1013
 BREAKS_RULES = 1008
 """WebSocket close code "policy violation"."""
 MOST_FAILED = 20
-"""Messages that viser fails at, such as a text for a slider, before the connection is closed.
-Larger: a longer log from such a client."""
+"""Messages that viser fails at, such as a text for a slider, before the connection is closed."""
 
 
 class MachineFiles(NamedTuple):
@@ -106,7 +104,7 @@ class PageConnection:
             try:
                 self.visitor(client)
             except KeyError:
-                self.send("refused")
+                self.send(REFUSED)
                 await live[client].close(LATE, "connect through the server")
             nonsense.contain(connection)
 
@@ -129,18 +127,16 @@ class PageConnection:
         ids = tuple(int(i) for i in request.headers.get(SHOWN, "").split(",") if i)
         return Visitor(request.headers[NAME], request.headers[ROLE], ids)
 
-    def send(self, word: str) -> None:
+    def send(self, word: bytes) -> None:
         """Send a message to the server; ignored if the server has ended."""
         with contextlib.suppress(OSError):
-            self._socket.sendall(line(word))
+            self._socket.sendall(word)
 
     def _listen(self) -> None:
         with contextlib.suppress(ConnectionError), self._socket.makefile("rb") as stream:
-            while received := stream.readline(LONGEST_LINE):
-                message = json.loads(received)
-                match message["word"]:
-                    case "ping":
-                        self.send("pong")
+            for received in stream:
+                if received == PING:
+                    self.send(PONG)
 
 
 class _Nonsense:
@@ -176,8 +172,3 @@ class _Nonsense:
         LOG.warning("a browser's %s cannot be taken in: %s", type(message).__name__, words)
         if failed == MOST_FAILED:
             await live.close(BREAKS_RULES, "too many messages that mean nothing here")
-
-
-def line(word: str, text: str = "") -> bytes:
-    """Encoded message: JSON and a newline."""
-    return json.dumps({"word": word, "text": text}).encode() + b"\n"

@@ -16,8 +16,6 @@ from http.cookies import CookieError, SimpleCookie
 
 from hapticdb.errors import UsageError
 
-COOKIE = "hapticdb"
-"""Name of the cookie. Browsers send a cookie to all ports of a machine, so the port is appended."""
 SIGNED_IN_SECONDS = 3600.0
 """Lifetime of a cookie after its last use, seconds. Larger: the same for a stolen one."""
 MOST_SIGNED_IN = 1024
@@ -81,8 +79,8 @@ class Access:
 
     @property
     def cookie_name(self) -> str:
-        """Name of this server's cookie."""
-        return f"{COOKIE}-{self.port}"
+        """Name of this server's cookie: browsers send a cookie to all ports of a machine."""
+        return f"hapticdb-{self.port}"
 
     def role_of_token(self, token: str) -> Role | None:
         """Role of a token; None for a wrong one. Takes equally long for both."""

@@ -145,9 +145,6 @@ def _bytes_of(digits: NDArray[np.uint8]) -> bytes:
     return whole.astype(">u4").tobytes() + tail.to_bytes(max(rest - 1, 0), "big")
 
 
-MOST_ADDRESSES = 4096
-"""Addresses with counted sign-in attempts; a new one replaces the oldest. Smaller: a client of many
-addresses gets more attempts."""
 STYLE = (
     "body{font:16px system-ui,sans-serif;max-width:24rem;margin:20vh auto;padding:0 1rem}"
     "input,button{font:inherit;padding:.5rem;width:100%;box-sizing:border-box;margin-top:.5rem}"
@@ -237,17 +234,14 @@ class SignIn:
         address = ":".join(address.split(":")[:4])
         limits = self._limits
         if address not in self._tries:
-            if len(self._tries) >= MOST_ADDRESSES:
+            if len(self._tries) >= 4096:  # a new address replaces the oldest
                 del self._tries[next(iter(self._tries))]
             self._tries[address] = TokenBucket(limits.sign_ins_per_second, limits.sign_ins_at_once)
         return self._tries[address].take()
 
     def _form(self, words: str, status: int) -> Response:
-        page = FORM.format(
-            title=html.escape(self._title),
-            style=STYLE,
-            words=html.escape(words),
-        )
+        title, words = html.escape(self._title), html.escape(words)
+        page = FORM.format(title=title, style=STYLE, words=words)
         return HTMLResponse(page, status, {"content-security-policy": POLICY})
 
     def _view(self, request: Request) -> Response:

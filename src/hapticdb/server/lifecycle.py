@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
 LOG = logging.getLogger("hapticdb.server")
-PING_EVERY = 20.0
-"""Seconds between two pings to a browser. Larger: a vanished browser is noticed later."""
-PING_TIMEOUT = 60.0
-"""Time limit of a browser's pong, seconds: on a slow network it waits behind the scene."""
 HEADER_BYTES = 16 << 10
 """Most bytes of a request's headers."""
 
@@ -145,8 +141,8 @@ def _config(app: "ASGIApp", serving: Serving) -> uvicorn.Config:
         ws=websocket,
         ws_max_size=64 * LARGEST,  # a smaller one above the limit is dropped, and counted
         ws_per_message_deflate=False,  # compressing costs more time than it saves here
-        ws_ping_interval=PING_EVERY,
-        ws_ping_timeout=PING_TIMEOUT,
+        ws_ping_interval=20.0,
+        ws_ping_timeout=60.0,  # on a slow network a pong waits behind the scene
         lifespan="off",
         log_config=None,
         access_log=False,

@@ -2,14 +2,13 @@
 
 import asyncio
 import contextlib
-import json
 import logging
 import secrets
 import socket
 from collections.abc import Callable
 
 from hapticdb.errors import HapticDBError
-from hapticdb.page.connection import LONGEST_LINE, NAME, ROLE, SECRET, SHOWN, line
+from hapticdb.page.connection import NAME, PING, PONG, REFUSED, ROLE, SECRET, SHOWN
 from hapticdb.session.processes.process import Process
 
 LOG = logging.getLogger("hapticdb.server")
@@ -20,9 +19,7 @@ ANSWER_TIMEOUT = 2.0
 FIRST_PAUSE = 0.5
 """Seconds before a dead page is restarted; doubled at each further death."""
 LONGEST_PAUSE = 30.0
-"""Greatest such pause. Larger: a failing page costs less, and comes back later."""
-LASTING = 60.0
-"""Least lifetime of a page to reset the pause, seconds."""
+"""Greatest such pause."""
 
 
 class PageSupervisor:
@@ -76,7 +73,7 @@ class PageSupervisor:
             self._process = None
             await asyncio.to_thread(process.end)
             raise
-        self._reader, self._writer = await asyncio.open_connection(sock=ours, limit=LONGEST_LINE)
+        self._reader, self._writer = await asyncio.open_connection(sock=ours)
         self.n_starts += 1
         LOG.info("the page is ready", extra={"pid": process.pid})
 
@@ -105,7 +102,7 @@ class PageSupervisor:
             if self._is_stopping:
                 return
             await self._end()
-            if loop.time() - began > LASTING:
+            if loop.time() - began > 60.0:
                 pause = FIRST_PAUSE
             LOG.error("the page process ended; it is started again in %.3g s", pause)
             await asyncio.sleep(pause)
@@ -119,17 +116,12 @@ class PageSupervisor:
         """Headers for a browser's connection: name, role, ids of shown parts, and the secret."""
         return {SECRET: self._secret, NAME: name, ROLE: role, SHOWN: shown}
 
-    def send(self, word: str, text: str = "") -> None:
-        """Send the page a message; no effect without a page."""
-        if self._writer is not None:
-            self._writer.write(line(word, text))
-
     async def answers(self) -> bool:
         """Whether the page responds now, within `ANSWER_TIMEOUT`."""
-        if not self.is_ready:
+        if not self.is_ready or self._writer is None:
             return False
         self._has_answered.clear()
-        self.send("ping")
+        self._writer.write(PING)
         try:
             await asyncio.wait_for(self._has_answered.wait(), ANSWER_TIMEOUT)
         except TimeoutError:
@@ -148,11 +140,10 @@ class PageSupervisor:
             return
         with contextlib.suppress(OSError, ValueError):
             while received := await reader.readline():
-                match json.loads(received)["word"]:
-                    case "pong":
-                        self._has_answered.set()
-                    case "refused":
-                        LOG.warning("a connection to the page went round the server: closed")
+                if received == PONG:
+                    self._has_answered.set()
+                elif received == REFUSED:
+                    LOG.warning("a connection to the page went round the server: closed")
 
     async def _end(self) -> None:
         self.port = 0

@@ -26,10 +26,6 @@ VERSION = re.compile(r"viser-v[0-9A-Za-z.+-]{1,32}")
 """WebSocket subprotocol with the version of viser's client, compared by the page."""
 IDS = re.compile(r"(\d{1,10}(,\d{1,10}){0,49})?")
 """Form of the parts that a link shows."""
-WAITING_MESSAGES = 4
-"""Queued messages of the page for one browser."""
-CONNECT_TIMEOUT = 5.0
-"""Time limit of the connection to the page, seconds."""
 CLOSING_TIMEOUT = 5.0
 """Time limit of a browser's close handshake, seconds."""
 RENEW_EVERY = 60.0
@@ -126,9 +122,9 @@ class Relay:
                 subprotocols=[version],
                 compression=None,  # costs more time than the loopback interface
                 max_size=None,
-                max_queue=WAITING_MESSAGES,
+                max_queue=4,
                 ping_interval=None,
-                open_timeout=CONNECT_TIMEOUT,
+                open_timeout=5.0,
                 proxy=None,
             )
         except (OSError, InvalidHandshake, TimeoutError) as error:

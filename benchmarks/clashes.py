@@ -105,12 +105,12 @@ def measured(what: str, url: str) -> dict[str, Any]:
         found = hapticdb.find_clashes(env)
         counts = found.counts()
         ended, over = time.process_time(), time.perf_counter()
-        n_told = len(found.pairs)
+        n_listed = len(found.pairs)
         listed = time.process_time()
     return {
         "search": what,
         "pairs": found.measured,
-        "told": {"listed": n_told} if is_alone else counts,
+        "counts": {"listed": n_listed} if is_alone else counts,
         "cpu_s": ended - began,
         "s": over - wall,
         "list_cpu_s": listed - ended,

@@ -88,7 +88,7 @@ def edits(url: str, tool: FilePath, path: FilePath, n_edits: int) -> dict[str, A
         "edits": n_edits,
         "voxels": voxels,
         "seconds_of_a_move": float(np.median(took)),
-        "felt_after_ms": {"p50": p50, "p90": p90, "worst": worst},
+        "latency_ms": {"p50": p50, "p90": p90, "worst": worst},
         "unknown_frames": report.unknown_frames,
     }
 
@@ -104,7 +104,7 @@ def until_after(session: Session, revision: int) -> float:
     deadline = time.monotonic() + TIMEOUT
     while revision_of(session) <= revision:
         if time.monotonic() > deadline:
-            raise SystemExit(f"no frame has felt what came after revision {revision}")
+            raise SystemExit(f"no frame has a revision after {revision}")
         time.sleep(LOOK)
     return time.monotonic()
 

@@ -97,7 +97,7 @@ def measured(folder: Path, data: Path, name: str, bits: int) -> dict[str, Any]:
             "gap_m": found.gap.at_least,
             "gap_at_most_m": found.gap.at_most,
             "cpu_s": spent,
-            "looks": found.queries,
+            "queries": found.queries,
             "voxel_m": env.grid.voxel_size,
             "force_on_axis_n": float(np.linalg.norm(held[0])),
             "force_aside_n": np.asarray(held[1]).tolist(),

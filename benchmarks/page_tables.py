@@ -69,7 +69,7 @@ def sessions(results: Results) -> str:
         results["realtime"]["sessions"],
         {
             "engine": lambda one: one["engine"],
-            "asked, Hz": lambda one: f"{one['rate']:,.0f}",
+            "set, Hz": lambda one: f"{one['rate']:,.0f}",
             "reached": lambda one: f"{one['loop']['rate']:,.0f}",
             "late": lambda one: _times(one["loop"]["lateness"]),
             "computing": lambda one: _times(one["loop"]["elapsed"]),
@@ -97,10 +97,10 @@ def frames(results: Results) -> str:
 
 
 def edits(results: Results) -> str:
-    """Milliseconds from the commit of an edit to the first frame that felt it."""
+    """Milliseconds from the commit of an edit to the first frame with it."""
     rows = []
     for one in results["realtime"]["edits"]:
-        after = (f"{ms:.1f}" for ms in one["felt_after_ms"].values())
+        after = (f"{ms:.1f}" for ms in one["latency_ms"].values())
         rows.append([one["engine"], f"{one['edits']}", f"{one['voxels']:,}", *after])
     head = ["engine", "moves", "voxels", "median, ms", "90 % within, ms", "worst, ms"]
     return table(head, rows)
@@ -134,7 +134,7 @@ def gpu_frames(results: Results) -> str:
 
 
 def gpu_hands(results: Results) -> str:
-    """Sessions whose looks are on a GPU, beside those whose looks are on a processor."""
+    """Sessions with proximity queries on a GPU, beside those on a processor."""
     rows = []
     for one in results["gpu"]["hands"]:
         gpu, processor = one["gpu"], one["processor"]
@@ -159,7 +159,7 @@ def gpu_batches(results: Results) -> str:
 
 
 def removal_paths(results: Results) -> str:
-    """Answer and lengths of each question; what blocks first where no way was found."""
+    """Answer and lengths of each question; without a path, the first blocking object."""
     rows = []
     for one in results["removal_paths"]["rows"]:
         answer, lengths = one["verdict"], [NONE] * 3

@@ -44,8 +44,8 @@ class Measure:
         factor, unit = (100.0, "%") if self.percent else (1.0, self.unit)
         numbers = " / ".join(number_text(factor * value) for value in cell["values"])
         said = f"{numbers} {unit}".strip()
-        if cell.get("unfelt"):
-            said += f"; nothing felt in {cell['unfelt']:,} of {cell['slides']:,}"
+        if cell.get("without_force"):
+            said += f"; no force in {cell['without_force']:,} of {cell['slides']:,}"
         return f"**{said}**" if self.missed(cell) else said
 
 

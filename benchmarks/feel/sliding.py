@@ -101,10 +101,10 @@ def ripple_of_sessions(folder: Path, n_random: int) -> dict[str, Any]:
                 found = slide_at_depths(ground, scene, shell)
                 ripples = [ripple(force) for force in found.sliding]
                 rows.append({"points": across**2, "values": ripples})
-    felt = np.array([row["values"] for row in rows])
-    unfelt = int((felt == np.inf).any(axis=1).sum())
-    worst = np.where(felt < np.inf, felt, 0.0).max(axis=0)
-    return {"values": worst.tolist(), "unfelt": unfelt, "slides": len(rows)}
+    values = np.array([row["values"] for row in rows])
+    n_without = int((values == np.inf).any(axis=1).sum())
+    worst = np.where(values < np.inf, values, 0.0).max(axis=0)
+    return {"values": worst.tolist(), "without_force": n_without, "slides": len(rows)}
 
 
 def step_on_entering(folder: Path, n_random: int) -> dict[str, Any]:

@@ -92,10 +92,10 @@ def slides_of_touch(law: Law, folder: Path, n_random: int) -> dict[str, dict[str
                     if (scene.name, across, depth) == ("20 degrees", 3, 0.5):
                         curve = normal.tolist()
     ripples = [worst_ripple(r["ripple"] for r in rows if r["points"] == n**2) for n in ACROSS]
-    unfelt = sum(row["ripple"] == np.inf for row in rows)
+    n_without = sum(row["ripple"] == np.inf for row in rows)
     ways = (np.arange(len(curve)) * APART * 1e3).tolist()
     return {
-        "touch_ripple": {"values": ripples, "unfelt": unfelt, "slides": len(rows)},
+        "touch_ripple": {"values": ripples, "without_force": n_without, "slides": len(rows)},
         "touch_step": {"values": [step_to(rows, SHALLOW), step_to(rows, DEPTHS[-1])]},
         "curve": {"label": "20 degrees, 9 points, depth 0.5 voxels", "x": ways, "y": curve},
     }
@@ -107,7 +107,7 @@ def step_to(rows: Iterable[dict[str, Any]], depth: float) -> float:
 
 
 def worst_ripple(ripples: Iterable[float]) -> float:
-    """Largest finite ripple; a slide on which nothing is felt has none."""
+    """Largest finite ripple; a slide without force has none."""
     return max(value for value in ripples if value < np.inf)
 
 

@@ -60,7 +60,7 @@ def claim(results: Results) -> str:
 
 
 def visits(results: Results) -> str:
-    """Frames over bricks met for the first time and again, beside frames that read."""
+    """Frames over bricks read for the first time and again, beside frames without memory."""
     rows = []
     for where, group in grouped(cells_of(results, "visits"), ("environment",)).items():
         us = {(c["law"], c.get("visit", c["strategy"])): typical(c) for c in group}
@@ -116,7 +116,7 @@ def first_start(results: Results) -> str:
 
 
 def warm(results: Results) -> str:
-    """Processor time of verbs once all is compiled and the tool is kept."""
+    """Processor time of verbs after compilation, with the tool in the cache."""
     return "\n".join(
         f"- `{cell['verb']}`: {cell['cpu_s']:.2f} s of processor time."
         for cell in cells_of(results, "warm")
@@ -263,13 +263,13 @@ def speed(results: Results) -> str:
 
 
 def exactness(results: Results) -> str:
-    """How far what is proved is from what coal measures, and how many pairs were told."""
+    """Difference of the proved distances from coal's, and numbers of pairs."""
     rows = [row for row in results["removal_paths"]["rows"] if "length_m" in row]
     apart = [1e3 * (row["mesh_distance_m"] - row["gap_m"]) for row in rows]
     every = next(c for c in cells_of(results, "clashes") if c["search"] == "everything")
-    told = every["told"]
-    pairs = ", ".join(f"{told[kind]:,} {kind}" for kind in told)
-    farther = every["pairs"] - sum(told.values())
+    counts = every["counts"]
+    pairs = ", ".join(f"{counts[kind]:,} {kind}" for kind in counts)
+    farther = every["pairs"] - sum(counts.values())
     return (
         f"- {len(rows)} ways out of the sample car were proved free. coal's distance at "
         f"4,000 places of each is above the proved gap by {min(apart):.3f} to {max(apart):.3f} mm"

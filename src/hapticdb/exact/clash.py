@@ -64,6 +64,7 @@ def classify_pair(
         return _result(Kind.NOT_KNOWN if near.pairs[0, 0] >= 0 else Kind.FAR, near)
     gap, separation = float(near.at_least[0]), Separation(a, b)
     if gap > 0.0:
+        # first: a body may be farther than `within` from the surface around it
         if separation.is_nested(pose):
             near = near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose)
             return _result(Kind.INSIDE if gap > error or not error else Kind.NOT_KNOWN, near, error)
@@ -71,10 +72,12 @@ def classify_pair(
             return _result(Kind.FAR, near, error)
         if gap - error > contact:
             return _result(Kind.APART, near, error)
+        # the true gap is within the chord errors of this one: decided if both its bounds agree
         if gap + error <= contact or not error:
             return _result(Kind.TOUCHING, near, error)
         return _result(Kind.NOT_KNOWN, near, error)
     separation.note_nearest(pose, near.pairs)
+    # freed by less: the true surfaces touch, too; freed by more alone: they may
     freed = _freed(separation, pose, contact - error)
     if freed == Kind.TOUCHING or (freed == Kind.INSIDE and not error):
         return _result(freed, near, error)
@@ -115,6 +118,7 @@ def _overlap(
 ) -> PairResult:
     """Bounds of how deep surfaces overlap that no motion of the tolerance frees."""
     depth, place = separation.depth(pose, contact)
+    # no motion up to here frees them, as was just searched
     least = max(contact + error, depth)
     at_most = separation.least(pose, least, separation.most_reach, TINY, gap=0.0)
     place = place if depth else near.on_a[0]

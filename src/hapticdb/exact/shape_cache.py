@@ -37,6 +37,7 @@ class Shapes:
                 return None
             self._kept[key] = shape
             self._bytes += _bytes_of(shape)
+            # two stay, whatever their size: a pair needs both
             while self._bytes > self._budget and len(self._kept) > 2:
                 self._bytes -= _bytes_of(self._kept.popitem(last=False)[1])
         self._kept.move_to_end(key)
@@ -51,6 +52,7 @@ class Shapes:
 
     def _read(self, obj: Object, linear: Floats) -> CollisionShape | None:
         packed = self._store.surfaces([obj.digest]).get(obj.digest)
+        # gone, or written meanwhile with another digest; else it is damage, reported below
         if packed is None and all(
             now.digest != obj.digest for now in self._store.objects([obj.id])
         ):
@@ -58,6 +60,7 @@ class Shapes:
         part = unpacked_part(self._store.url, obj, packed)
         corners = part.vertices @ linear.T
         if part.faces is None:
+            # a point is a triangle of three equal corners
             return CollisionShape(np.repeat(corners[:, None], 3, axis=1), is_cloud=True)
         return CollisionShape(corners[part.faces], chord=part.placed_chord, index=part.faces)
 
@@ -70,8 +73,10 @@ def _rigid_placement(transform: Floats) -> tuple[Floats, Floats]:
     """A linear map (3, 3) to be built into the shape, and the rigid placement of the result."""
     linear, pose = transform[:3, :3], np.eye(4)
     pose[:3, 3] = transform[:3, 3]
+    # negative for a mirror: the rest is a proper rotation
     scale = float(np.cbrt(np.linalg.det(linear)))
     if scale != 0.0:
+        # exactly 1 or -1 within rounding: equal keys, so that copies share a shape
         scale = float(np.sign(scale)) if abs(abs(scale) - 1.0) < RIGID else scale
         rotation = linear / scale
         if np.abs(rotation.T @ rotation - np.eye(3)).max() < RIGID:

@@ -14,6 +14,7 @@ FARTHEST = 1e9
 
 def number_of(value: object, low: float, high: float, what: str) -> float:
     """A finite number in [low, high]."""
+    # to Python a bool is an int
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise UsageError(f"{what}: give a number")
     number = float(value)
@@ -49,6 +50,7 @@ def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.floa
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         numbers = np.empty(0)
+    # NaN fails the comparison, too
     if numbers.shape != (n,) or not bool((np.abs(numbers) <= most).all()):
         raise UsageError(f"{what}: give {n} numbers, {most:g} at most")
     return numbers

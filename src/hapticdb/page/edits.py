@@ -52,6 +52,7 @@ class _Step:
             return f"{'took out' if self.kind == 'take out' else self.kind} {whom}"
         shift = self.place[:3, 3] - self.before.transform[:3, 3]
         turned = self.place[:3, :3] @ np.linalg.inv(self.before.transform[:3, :3])
+        # clipped: rounding may bring the cosine beyond 1
         angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0)))
         text = f"moved {whom} by {1000 * float(np.linalg.norm(shift)):.4g} mm"
         return f"{text}, turned it by {angle:.3g} degrees" if angle > 0.01 else text

@@ -42,6 +42,7 @@ class PanelJob:
         """Queue a job; it and then `show` run in the site's thread for long jobs."""
         if self._is_running:
             raise UsageError(f"{self._what} is running: wait for it")
+        # before the job waits in the queue: a second press meanwhile is refused
         self._is_running, self._doing = True, WAITS
         put(self._bar, 0.0)
         self._bar.visible = True

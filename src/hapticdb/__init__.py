@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     from hapticdb.transfer import CopyReport as CopyReport
     from hapticdb.transfer import copy_environment as copy_environment
 
-__version__ = "0.1.0"
+__version__ = "0.1.0rc1"
 
 _LINES = Path(__file__).read_text("utf-8").splitlines()
 _WORDS = [line.split() for line in _LINES if line.startswith("    from hapticdb.")]

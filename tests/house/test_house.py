@@ -6,10 +6,8 @@ import os
 import re
 import shutil
 import sys
-import tomllib
 from collections.abc import Iterator
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 
 import hapticdb
@@ -243,9 +241,11 @@ def test_public_names() -> None:
         assert inspect.getdoc(getattr(hapticdb, name)), f"{name} has no docstring"
 
 
-def test_the_version_is_one() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert hapticdb.__version__ == project["version"] == version("hapticdb")
+def test_version_of_changelog_and_citation() -> None:
+    newest = re.search(r"^## \[(.+)\] - ", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest is not None
+    assert newest[1] == hapticdb.__version__
+    assert f"\nversion: {newest[1]}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 # --- the kernels' cache -------------------------------------------------------------------------

@@ -8,7 +8,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 # Three tests run on each two processors: most of them wait for servers half of their time.
 PYTEST := $(BIN)/pytest tests --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) --dist=worksteal
 
-.PHONY: demo test test-long test-browser test-all test-plain lint types figures peers realtime feel scale paths clashes wheel pins clean
+.PHONY: demo test test-long test-browser test-all test-plain lint types figures peers realtime feel scale paths clashes site release pins clean
 
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
@@ -77,9 +77,22 @@ peers: .venv/figures
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --requirement requirements/figures.txt
 	touch $@
 
-wheel: $(READY)
+# the pages and the API as a site, build/site; a warning is an error
+site: .venv/release
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env --quiet -c docs -d build/doctrees . build/site
+
+# sdist, and the wheel made of it, tried in an empty environment; a wheel for each of several Pythons:
+# PYTHONS="python3.11 python3.13"
+release: PYTHONS ?= $(PYTHON)
+release: .venv/release
 	rm -rf dist
-	$(BIN)/python -m build --wheel --no-isolation
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/twine check --strict dist/*
+	for python in $(PYTHONS); do .ci/try "$$python" || exit; done
+
+.venv/release: requirements/release.txt $(READY)
+	$(PIP) --requirement requirements/release.txt
+	touch $@
 
 # newest versions that fit pyproject.toml, in an environment of their own
 pins:
@@ -92,7 +105,10 @@ pins:
 	.venv-pins/bin/pip install ".[step,ifc,volume,pointcloud,postgres,cluster,extract,parquet,machines]" --group dev
 	head -1 requirements/dev.txt > .venv-pins/dev.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb | grep -vxFf .venv-pins/user.txt >> .venv-pins/dev.txt
-	mv .venv-pins/user.txt .venv-pins/dev.txt requirements/
+	.venv-pins/bin/pip install --group release
+	head -1 requirements/release.txt > .venv-pins/release.txt
+	.venv-pins/bin/pip freeze --exclude hapticdb | grep -vxFf .venv-pins/user.txt -f .venv-pins/dev.txt >> .venv-pins/release.txt
+	mv .venv-pins/user.txt .venv-pins/dev.txt .venv-pins/release.txt requirements/
 	rm -rf .venv-pins
 
 # kernels are compiled beside the rest of the installation; Python compiles a module when it is first imported
@@ -111,4 +127,4 @@ $(READY): requirements/dev.txt $(USER)
 	touch $(READY)
 
 clean:
-	rm -rf .venv dist demo results-quick .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build dist demo results-quick .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from hapticdb.ingest.files import FileReport as FileReport
     from hapticdb.ingest.files import ImportOptions as ImportOptions
     from hapticdb.ingest.files import import_files as import_files
+    from hapticdb.machines.envelope import sweep_envelope as sweep_envelope
     from hapticdb.machines.machine import Machine as Machine
     from hapticdb.machines.machine_sweep import sweep_machine as sweep_machine
     from hapticdb.machines.reader import read_machine as read_machine

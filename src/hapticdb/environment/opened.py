@@ -14,7 +14,7 @@ from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ing
 from hapticdb.ingest.geometry import shell_of_objects
 from hapticdb.ingest.layout import voxels_of_rows
 from hapticdb.ingest.object_moves import move_object, restore_object, shift_objects
-from hapticdb.mesh import read_file
+from hapticdb.mesh import MeshFile, Part, read_file
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.figures import QueryFigures
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
@@ -124,7 +124,7 @@ class Environment(Queries, Closes):
 
     def add(
         self,
-        file: str | os.PathLike[str],
+        file: str | os.PathLike[str] | Part,
         *,
         unit: str | None = None,
         jobs: int | None = None,
@@ -135,7 +135,8 @@ class Environment(Queries, Closes):
     ) -> FileReport:
         """Import a file's parts on this environment's grid, each in a transaction of its own.
 
-        file : mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`
+        file : mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`. Or a part, such as of
+            `hapticdb.sweep_envelope`; its name is that of its file, too
         unit : unit of a file without one, of `hapticdb.mesh.UNITS`; metres unless given
         jobs : threads of voxelization; one for each processor unless given
         keep_removed : skip parts removed from the environment; otherwise they are added again
@@ -151,7 +152,11 @@ class Environment(Queries, Closes):
             unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed, replace=replace,
             chord=chord,
         )  # fmt: skip
-        mesh_file = read_file(file, **options.reading)
+        mesh_file = (
+            MeshFile(file.name, [file], file.defects, names_unit=True)
+            if isinstance(file, Part)
+            else read_file(file, **options.reading)
+        )
         with self._store.loading():
             report = ingest_file(self._store, mesh_file, options, progress)
         if report.status == "imported":

@@ -241,3 +241,43 @@ def test_a_foreign_tool_has_no_seat(run: Run, seam: Path, monkeypatch: pytest.Mo
     words = ("--path", "up.csv", "--exclude", "hood")
     code, out, _ = run("sweep", seam, "--tool", "hood.obj", "--tool-unit", "m", *words)
     assert (code, out.partition(":")[0]) == (1, "starts inside seam")
+
+
+@pytest.mark.usefixtures("through")
+def test_sweep_envelope_is_stored_and_replaced(run: Run, scene: Path) -> None:
+    words = ("sweep", scene, *TOOL, "--path", "through.csv", "--until-hit", "--envelope", "swept")
+    code, out, err = run(*words, "--envelope-voxel", 10)
+    assert (code, err) == (1, "hapticdb: envelope stored as swept, in voxels of 10 mm\n")
+    assert out.startswith("hits box0 at ")
+    with hapticdb.open(scene) as env:
+        (stored,) = env.find("envelope=tool.stl")
+    assert (stored.id, stored.name) == (4, "swept")
+    assert stored.attributes["path"] == "through.csv"
+    found = [json.loads(one) for one in run("clashes", scene, "--of", 4, "--json")[1].splitlines()]
+    assert {one["a_name"] for one in found if "a_name" in one} == {"box0", "box1", "box2"}
+    refused(run(*words), "--envelope swept: object 4", "--replace")
+    # the former envelope is not met
+    again = run(*words, "--replace", "--json")
+    assert (again[0], json.loads(again[1])["excluded"]) == (1, [4])
+    with hapticdb.open(scene) as env:
+        assert env.object(4).attributes["voxel"] != "10 mm"
+    refused(run(*words[:-1], "box1", "--replace"), "--envelope box1: object 2")
+    refused(run(*words[:-2], "--envelope-voxel", 2), "--envelope-voxel")
+    refused(run("sweep", scene, "--batch", "many.csv", "--envelope", "swept"), "--batch")
+    refused(run(*words[:-1], "fine", "--envelope-voxel", "1um"), "1 µm", "would do")
+
+
+def test_sweep_envelope_stores_that_of_a_machine(run: Run, scene: Path) -> None:
+    scene.with_name("crane.urdf").write_text(
+        '<robot name="crane"><link name="base"/><link name="hook"><collision><geometry>'
+        '<box size="0.02 0.02 0.02"/></geometry></collision></link><joint name="lift" '
+        'type="prismatic"><parent link="base"/><child link="hook"/><axis xyz="0 0 1"/></joint>'
+        "</robot>"
+    )
+    scene.with_name("lift.csv").write_text("lift\n0\n0.02\n")
+    words = ("--machine", "crane.urdf", "--joints", "lift.csv", "--at", "0,0,70,1,0,0,0")
+    assert run("sweep", scene, *words, "--envelope", "crane", "--envelope-voxel", 1)[0] == 0
+    with hapticdb.open(scene) as env:
+        low, high = env.find("crane")[0].bounds
+    assert low == pytest.approx([-0.01, -0.01, 0.06], abs=2e-3)
+    assert high == pytest.approx([0.01, 0.01, 0.1], abs=2e-3)

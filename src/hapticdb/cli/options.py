@@ -149,6 +149,9 @@ sweep.path FILE: Poses, as for touch --poses.
 sweep.about X,Y,Z/mm [middle of the tool's box]: the centre of the path's turns, tool's frame.
 sweep.batch CSV: Many sweeps, one a line; see above.
 sweep.seconds S [no limit]: Time of a sweep.
+sweep.envelope NAME: Store all that the motion sweeps as an object of this name.
+sweep.envelope_voxel LENGTH/mm [2 million in the path's box]: edge of its voxels.
+sweep.replace: Replace an envelope of this name.
 sweep.until_hit: End at the first hit on the path: faster.
 
 clashes.within LENGTH/mm [1]: pairs that are so near are told.

@@ -56,6 +56,8 @@ two rows, and are tested against objects and one another.
 --batch reads a CSV file with the columns part or tool, and path; and if wanted where, exclude and
 contact (mm, or such as 0.2in). Several words in a cell stand with ; between.
 
+--envelope stores a closed surface around all that moves on the path as an object, for clashes.
+
 {exit_codes(SWEEP_VERDICTS)}
 A batch has the worst: 1 before 3 before 4 before 0.
 
@@ -83,6 +85,25 @@ class MachineOptions:
     joints: str | None = None
     srdf: str | None = None
     at: str | None = None
+
+
+@dataclass(frozen=True)
+class EnvelopeOptions:
+    """Options of the stored envelope."""
+
+    envelope: str | None = None
+    envelope_voxel: float | None = None
+    replace: bool = False
+
+    def former(self, env: "Environment") -> list[str]:
+        """Id of the envelope to replace; UsageError for any other object of its name."""
+        found = [obj for obj in env.objects() if obj.name == self.envelope]
+        for obj in found:
+            # a stored part is its own file
+            if obj.link != obj.name or not self.replace:
+                hint = "give another, or --replace if it is an envelope"
+                raise UsageError(f"--envelope {obj.name}: object {obj.id} has this name: {hint}")
+        return [str(obj.id) for obj in found]
 
 
 class _Job(NamedTuple):
@@ -114,6 +135,7 @@ def sweep(
     selection: FilterOptions,
     contact: float = 5e-5,
     motion: SweepOptions,
+    stored: EnvelopeOptions,
     output: TableOutput,
 ) -> None:
     """See `HELP`."""
@@ -126,8 +148,11 @@ def sweep(
         one = _checked_machine(one, machine, motion, batch)
     else:
         _check(one, motion.tool_unit, batch, output.csv)
+    if batch is not None or not stored.envelope:
+        refuse("with --batch, or without a name for --envelope", stored)
     requests = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(output.csv, SWEPT_KEYS) as table, hapticdb.open(url, read_only=True) as env:
+        exclude += stored.former(env)
         if machine.machine is None:
             jobs = [_job(env, each, motion.path_unit) for each in requests]
             findings = _all_told((_swept(env, job, motion) for job in jobs), output)
@@ -139,6 +164,8 @@ def sweep(
             _show(findings[0])
         elif output.has_words:
             _show_batch(findings)
+    if stored.envelope:
+        _store(url, findings[0], machine, motion, stored)
     codes = {one.found.verdict.exit_status for one in findings}
     raise typer.Exit(next(code for code in WORST if code in codes))
 
@@ -185,6 +212,23 @@ def _job(env: "Environment", request: ListedSweep, path_unit: str | None) -> _Jo
         return _Job(
             request, poses, parts, FilterOptions(request.where, request.exclude).resolve(env, parts)
         )
+
+
+def _store(
+    url: str, one: _Findings, given: MachineOptions, motion: SweepOptions, stored: EnvelopeOptions
+) -> None:
+    """Store the envelope of a sweep."""
+    import hapticdb
+
+    moved = one.shell or hapticdb.read_machine(given.machine or "", given.srdf)
+    with render.bar("making the envelope", "samples"), hapticdb.open(url) as env:
+        part = hapticdb.sweep_envelope(
+            moved, one.job.poses, stored.envelope or "", voxel=stored.envelope_voxel,
+            about=motion.about, at=None if given.at is None else pose_of(given.at, "--at"),
+        )  # fmt: skip
+        part.attributes.update(envelope=one.job.request.name, path=one.job.request.path)
+        env.add(part, replace=stored.replace)
+    render.note(f"envelope stored as {part.name}, in voxels of {part.attributes['voxel']}")
 
 
 def _all_told(sweeps: Iterable[_Findings], output: TableOutput) -> list[_Findings]:

@@ -17,7 +17,6 @@ from hapticdb.page import checks, colours
 from hapticdb.page.browser import Browser
 from hapticdb.page.drawing import add_marks, put_at
 from hapticdb.page.panels.jobs import PanelJob, Progress
-from hapticdb.page.panels.move_controls import MOVING_GIZMO
 from hapticdb.page.panels.sweeps import swept_html
 from hapticdb.page.site import TICKS
 from hapticdb.page.widgets import put
@@ -59,7 +58,7 @@ class MachinePanel:
         gui.add_button("Sweep the machine").on_click(guard("viewer", self._begin))
         self._work = PanelJob(browser, gui, "a sweep", "parts near the way")
         self._base = scene.add_transform_controls(
-            "/machine", scale=MOVING_GIZMO * site.facts.diagonal, line_width=3.5,
+            "/machine", scale=0.13 * site.facts.diagonal, line_width=3.5,
             disable_sliders=True, depth_test=False,
         )  # fmt: skip
         self._links: dict[int, Any] = {}

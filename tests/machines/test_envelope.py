@@ -9,7 +9,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 import hapticdb
-from contact_scenes import MM, Floats, box, hollow, imported, joined, pulls, rod, sheet, shell_of
+from contact_scenes import (
+    MM,
+    Floats,
+    box,
+    hollow,
+    imported,
+    joined,
+    pulls,
+    rod,
+    sheet,
+    shell_of,
+    turns,
+)
 from hapticdb import find_clashes, sweep_envelope
 from hapticdb.errors import GeometryChangedError, UsageError
 from hapticdb.machines import envelope
@@ -135,6 +147,11 @@ def test_sweep_envelope_refuses_voxels_that_are_too_small(monkeypatch: pytest.Mo
     assert sweep_envelope(cube, poses, "swept", voxel=would_do)
     with pytest.raises(UsageError, match="would do"):
         sweep_envelope(cube, poses, "swept", voxel=0.95 * would_do)
+    turning = turns("z", *range(90, 90 * 300, 90))
+    monkeypatch.setattr(envelope, "MOST_VISITS", 5e5)
+    with pytest.raises(UsageError, match="would do"):
+        sweep_envelope(shell_of(sheet(10.0)), turning, "swept", voxel=MM)
+    monkeypatch.undo()
     blunt = replace(cube, chord=MM)
     with pytest.raises(UsageError, match=r"; 4\.048 mm would do"):
         sweep_envelope(blunt, poses[:1], "swept", voxel=2 * MM)

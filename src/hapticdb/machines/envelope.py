@@ -30,7 +30,7 @@ Ints = NDArray[np.int64]
 MOST_CELLS, USUAL_CELLS = 1 << 26, 1 << 21
 """Voxels of the path's box: at most, 1 GiB, and unless their size is given."""
 MOST_VISITS = 1e9
-"""Visits of voxels, a minute of work; a triangle takes the time of four."""
+"""Visits of voxels, a minute of work: a triangle takes the time of 4, a sample that of 100."""
 BOX_SAMPLES, TRIANGLES_AT_ONCE, BRICKS_AT_ONCE = 1024, 1 << 18, 1 << 13
 """Samples of a path for its box; triangles and bricks of a batch, 0.1 GiB."""
 BORDER = 3
@@ -113,10 +113,10 @@ def _box(movers: Sequence[Mover]) -> tuple[Floats, Floats]:
 def _least_size(movers: Sequence[Mover], edges: Floats, most: int, wanted: float) -> float:
     """Least voxel size within the limits, not below the wanted one; most : voxels of the box."""
     bodies = [(path.length, tool.tree.corners) for tool, path, *_ in movers]
-    parts = [(far, len(corners), normals_of(corners)[1].sum()) for far, corners in bodies]
+    parts = [(far, 4 * len(one) + 100, normals_of(one)[1].sum()) for far, one in bodies]
     size = max(wanted, float(edges.max()) / most)
     while True:
-        visits = sum((far / size + 1.0) * (4.0 * n + area / size**2) for far, n, area in parts)
+        visits = sum((far / size + 1.0) * (n + area / size**2) for far, n, area in parts)
         if np.prod(edges / size + 2.0 * BORDER) <= most and visits <= MOST_VISITS:
             return size
         size *= 1.02

@@ -79,7 +79,7 @@ ITEM = rf"{NAME}(?:, {NAME})* : "
 def items(block: str) -> Iterator[tuple[str, str, str]]:
     """Names, shape and text of each item of a paragraph, ``a : text; b, c (3,) : text``."""
     text = re.sub(rf"\n(?!{ITEM})\s*", " ", block)
-    for item in re.split(rf"(?:; |;?\n)(?={ITEM})", text):
+    for item in re.split(rf"(?:; |(?<=\.) |;?\n)(?={ITEM})", text):
         names, _, said = item.partition(" : ")
         shape = "".join(re.findall(r" (\([^)]*\)(?: \w+)?)$", names))
         yield names.removesuffix(shape).rstrip(), shape, said
@@ -139,7 +139,8 @@ def undescribed(obj: Any, text: str) -> list[str]:
 def render(app: Sphinx, what: str, name: str, obj: object, options: Any, lines: list[str]) -> None:
     """Turn a docstring into reStructuredText, in place."""
     del options
-    heading = "Attributes" if what == "class" else "Parameters"
+    has_fields = what == "class" and (name not in CONSTRUCTED or is_dataclass(obj))
+    heading = "Attributes" if has_fields else "Parameters"
     given = numpy_style(lines, heading) if what in {"class", "function", "method"} else lines
     config = Config(napoleon_use_param=False, napoleon_use_rtype=False)
     # as an object: of an attribute napoleon takes the text before a colon for its type

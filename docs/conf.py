@@ -44,6 +44,7 @@ html_title = f"hapticdb {release}"
 
 root_doc = "README"
 include_patterns = ["*.md", "docs/**.md", "docs/**.rst"]
+exclude_patterns = [".*", "benchmarks", "build", "src", "tests"]  # not walked through
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 myst_heading_anchors = 4
 lexers["sql"] = PostgresLexer()  # knows $1

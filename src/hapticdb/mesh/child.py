@@ -93,13 +93,8 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         ],
         "chords": [part.chord for part in first.values()],
         "parts": [
-            [
-                part.name,
-                number[id(part.shared)],
-                vars(part.defects) if part.defects else {},
-                part.attributes,
-            ]
-            for part in file.parts
+            [one.name, number[id(one.shared)], vars(one.defects), one.attributes]
+            for one in file.parts
         ],
         "defects": vars(file.defects),
         "names_unit": file.names_unit,

@@ -26,16 +26,13 @@ from hapticdb.units import length_text
 Floats = NDArray[np.float64]
 
 DEFAULT = 1e-5
-"""Greatest chord error of a STEP file unless given, metres. A smaller value: more triangles, and
-more time where surfaces are curved both ways."""
+"""Greatest chord error of a STEP file unless given, metres."""
 LEAST, MOST = 1e-7, 1.0
 """Range of a requested chord error, metres. Below it a part of a few centimetres has millions of
 triangles, and 32-bit positions are as coarse."""
 MARGIN = 1.25
 """Factor on the patch heights, for the approximation error of a cubic patch."""
 
-_OVER = 1.05
-"""Ratio of the chord error to the requested one above which it is reported."""
 _STEPS = 6
 """Subdivisions of the lattice of height samples on a triangle; it contains halves and thirds."""
 _STEEP = math.sin(math.pi / 3)
@@ -71,7 +68,7 @@ def measured(shape: Shape, wanted: float) -> Shape:
 
 def coarser_note(shapes: Sequence[Shape], wanted: float) -> list[str]:
     """Note of shapes with a chord error above the requested one, metres."""
-    over = [one.chord for one in shapes if one.chord > _OVER * wanted]
+    over = [one.chord for one in shapes if one.chord > 1.05 * wanted]
     worst = length_text(max(over, default=0.0))
     words = "shape{s} {are} tessellated with a chord error of up to {worst}, not {wanted} as wanted"
     return count_note(len(over), words, worst=worst, wanted=length_text(wanted))
@@ -89,12 +86,8 @@ def chord_error(
     result is at least `wanted`: the mesher's tolerance is `wanted / MARGIN` (on circles it needs
     half).
 
-    Parameters
-    ----------
-    vertices, normals, faces : arrays
-        Positions (V, 3) and unit normals (V, 3), separate for each CAD face; corners (F, 3).
-    wanted : float
-        Chord error requested of the mesher, the vertices' unit.
+    vertices (V, 3), normals (V, 3) : separate for each CAD face; wanted : chord error requested of
+    the mesher, the vertices' unit.
     """
     rounding = float(np.spacing(np.abs(vertices).max(initial=0.0)))
     if normals is None:

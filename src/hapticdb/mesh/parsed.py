@@ -22,8 +22,6 @@ _ONE = {"s": "", "es": "", "ies": "y", "are": "is", "begin": "begins", "come": "
 """Plural endings and verbs in messages, and their singular."""
 HIDDEN = "node{s} {are} hidden in it, and {come} in like any other"
 ANIMATED = "node{s} {are} moved by animations, which are not read"
-_MOST_NAMES, _LONGEST_NAME = 3, 60
-"""Missing files listed in a note, and the last characters of each name."""
 
 
 class UnreadableError(Exception):
@@ -114,7 +112,7 @@ def missing_note(folder: Path, names: Iterable[str], *more: str) -> list[str]:
     plain = (name.removeprefix("file://") for name in names if name[:5] != "data:")
     gone = (name for name in plain if referenced_path(folder, name) is None)
     missing = list(dict.fromkeys([*more, *gone]))
-    which = ", ".join(name[-_LONGEST_NAME:] for name in missing[:_MOST_NAMES])
+    which = ", ".join(name[-60:] for name in missing[:3])
     words = "file{s} with its colours or pictures {are} not readable beside it: {which}"
     return count_note(len(missing), words, which=which)
 

@@ -24,11 +24,8 @@ def triangulated(
 ) -> tuple[Faces, int]:
     """Triangles (F, 3) of polygons, and the number of polygons of fewer than three corners.
 
-    Parameters
-    ----------
-    vertices : (V, 3) positions.
-    polygons : vertex indices, possibly out of range.
-    holes : by the number of a polygon with holes, offsets of the holes' first corners in it.
+    polygons : vertex indices, possibly out of range; holes : by the number of a polygon with holes,
+    offsets of the holes' first corners in it.
     """
     by_size: dict[int, list[Sequence[int]]] = {}
     pieces = [np.empty((0, 3), dtype=np.int64)]

@@ -40,8 +40,7 @@ _SECONDS_PER_MIB_OF = {"ifc": 20.0, "step": 20.0, "threemf": 10.0}
 the time of sound files. STEP and IFC files are tessellated, and 3MF files unpack to a multiple of
 their size. Larger values let a damaged file take longer before it is refused."""
 _WAITING = 10.0
-"""Wall-clock limit in multiples of the processor time limit, for a parser in an endless wait.
-Smaller: a busy machine may refuse a sound file."""
+"""Wall-clock limit in multiples of the processor time limit, for a parser in an endless wait."""
 _LIBRARIES = {
     "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
     "ifc": ("IfcOpenShell", "save it anew as IFC4, or as glTF"),
@@ -66,46 +65,28 @@ def read_file(
     Parsed in a child process of bounded memory and processor time: no file can crash or hang its
     reader.
 
-    Parameters
-    ----------
-    path : str or path
-        GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); IFC (extra `ifc`); LAS, LAZ
+    path : GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); IFC (extra `ifc`); LAS, LAZ
         (extra `pointcloud`). The suffix selects the format.
-    unit : str, optional
-        One of `hapticdb.mesh.UNITS`, for a file without a unit of its own (OBJ, STL, PLY, OFF, LAS,
-        LAZ). By default that of the reference system of a LAS or LAZ file, or of a comment, else
-        metres.
-    memory_limit : int, optional
-        Bytes of memory for parsing; by default in proportion to the file, see `child.allowance`.
-    time_limit : float, optional
-        Seconds of processor time for parsing; by default in proportion to the file. A parser that
+    unit : one of `hapticdb.mesh.UNITS`, for a file without a unit of its own (OBJ, STL, PLY, OFF,
+        LAS, LAZ). By default that of the reference system of a LAS or LAZ file, or of a comment,
+        else metres.
+    memory_limit : bytes for parsing; by default in proportion to the file, see `child.allowance`
+    time_limit : seconds of processor time; by default in proportion to the file. A parser that
         waits is ended after ten times as long.
-    chord : float, optional
-        Greatest chord error of the tessellation of a STEP file, 0.00001 m by default, or of an IFC
-        file, 0.0001 m; no effect on other files. The resulting one is `Part.chord`.
+    chord : greatest chord error of the tessellation of a STEP file, 0.00001 m by default, or of an
+        IFC file, 0.0001 m; no effect on other files. The resulting one is `Part.chord`.
 
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged, of an unknown kind, or contains no usable triangle or
-        point; one line with file and cause.
-    MissingExtraError
-        If the format needs an extra that is not installed.
-    UsageError
-        If the unit is unknown, or the chord error out of range.
+    Raises `FileError` if the file is missing, damaged, of an unknown kind, or contains no usable
+    triangle or point, one line with file and cause; `MissingExtraError` if the format needs an
+    extra; `UsageError` if the unit is unknown, or the chord error out of range.
     """
     check_chord(chord)
     metres, file = _checked(path, unit)
     seconds = _seconds_for(file) if time_limit is None else time_limit
     request = {
-        "path": str(file),
-        "metres": metres,
-        "chord": chord,
-        "memory_limit": memory_limit,
-        "time_limit": seconds,
-        "parent": os.getpid(),
-        "sys_path": sys.path,
-    }
+        "path": str(file), "metres": metres, "chord": chord, "memory_limit": memory_limit,
+        "time_limit": seconds, "parent": os.getpid(), "sys_path": sys.path,
+    }  # fmt: skip
     try:
         return _run_child(request, seconds)
     except UnreadableError as error:
@@ -180,12 +161,8 @@ def _one_line(path: str | os.PathLike[str], cause: object) -> str:
 def _run_child(request: dict[str, Any], seconds: float) -> MeshFile:
     """Run a request in a child process; no child outlives this call."""
     # One arena and one thread: memory reserved per thread would count as the file's.
-    settings = {
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-        "MKL_NUM_THREADS": "1",
-        "MALLOC_ARENA_MAX": "2",
-    }
+    settings = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    settings["MALLOC_ARENA_MAX"] = "2"
     with scratch_folder() as scratch, tempfile.TemporaryFile() as words:
         child = subprocess.Popen(  # noqa: S603 - our own interpreter and file
             [sys.executable, "-P", str(_CHILD)],

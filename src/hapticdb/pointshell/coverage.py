@@ -55,10 +55,8 @@ class Interior:
         closed = np.unique(surface.bodies[surface.bodies > 0])
         signs = np.where(np.bincount(surface.bodies, volumes)[closed] > 0.0, 1, -1)
         boxes = triangle_bvh.body_boxes(local, surface.bodies)[closed]
-        low, high = (
-            boxes[:, 0].min(axis=0, initial=np.inf),
-            boxes[:, 1].max(axis=0, initial=-np.inf),
-        )
+        low = boxes[:, 0].min(axis=0, initial=np.inf)
+        high = boxes[:, 1].max(axis=0, initial=-np.inf)
         self.solid = Solid(tree, closed, signs, boxes, np.stack([low, high]))
 
     def __bool__(self) -> bool:

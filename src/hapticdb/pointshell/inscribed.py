@@ -22,11 +22,10 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
 
 SLACK = 0.01
-"""Share of its radius by which surface may reach into an empty ball. A larger value draws points in
-over flatter edges: at 0.01, over convex edges of more than 172 degrees."""
+"""Share of its radius by which surface may reach into an empty ball: at 0.01, points are drawn in
+over convex edges of more than 172 degrees."""
 NEARLY = 0.05
-"""Share of its radius by which surface may be off a ball and still count as touching it. A larger
-value finds the opposite wall of rounder meshes, and drops fewer points on edges of thin walls."""
+"""Share of its radius by which surface may be off a ball and still count as touching it."""
 ALIGNED = 0.96
 """Cosine between a plane's normal and the direction to its nearest point above which the ball
 touches the plane and not its border: 16 degrees. Larger: fewer opposite walls of round tools."""
@@ -36,11 +35,9 @@ MOST_PAIRS = 2_000_000
 """Ball-triangle pairs of a batch, about: up to 0.5 kB each."""
 SMALL = 0.1
 """Size of a piece, in radii of a ball, up to which a query of the nearest middles of pieces
-replaces the search in the ball. A larger value is faster and errs more, by the size of a piece at
-most."""
+replaces the search in the ball; it errs by the size of a piece at most."""
 NEIGHBOURS = 4
-"""Nearest middles of a query, with exact distances to their pieces. Larger: fewer errors, and
-slower."""
+"""Nearest middles of a query, with exact distances to their pieces."""
 FEW = 100
 """Pieces of a fine mesh around a ball for its facing, about. Larger: slower."""
 ROUNDS = 60
@@ -131,10 +128,8 @@ class InscribedBalls:
             n_done += len(done[-1][1])
             pieces, solids = halves(pieces[is_long]), np.tile(solids[is_long], 2)
         done.append((pieces, solids))
-        return (
-            np.concatenate([pieces for pieces, _ in done]),
-            np.concatenate([solids for _, solids in done]),
-        )
+        whole, numbers = zip(*done, strict=True)
+        return np.concatenate(whole), np.concatenate(numbers)
 
     def touching(self, positions: Floats, face_of: NDArray[np.int32], radius: float) -> Balls:
         """Largest balls, `radius` at most, tangent to the surface at positions (Q, 3).

@@ -24,22 +24,14 @@ from hapticdb.poses import as_floats
 MAX_POINTS = 10_000_000
 """Greatest number of points of a shell."""
 DEFAULT_POINTS = 300
-"""Default number of points of a shell. More points resolve finer details, and take longer."""
-DENSE_POINTS = 200_000
-"""Default limit of the points of a shell with a given spacing; these take a few seconds."""
+"""Default number of points of a shell."""
 ORDER_BITS = 10
-"""Bits of the ordering curve: 2^10 steps along the longest side of the points' AABB. A larger value
-orders points of finer shells better, and changes every shell."""
+"""Bits of the ordering curve: 2^10 steps along the longest side of the points' AABB."""
 
 FORMAT = "hapticdb.pointshell.shell 1"
 """Name of the file format, stored in a saved shell."""
 
 Floats = NDArray[np.float64]
-
-
-LEAST_COMPONENT = 1e-100
-"""Least nonzero component of a normal; smaller ones become 0: PostgreSQL treats a product that
-underflows as an error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +74,8 @@ class PointShell:
             array = _as_floats(getattr(self, name), name)
             if array.ndim != len(shape) or array.shape[-1] != 3:
                 raise UsageError(f"a shell's {name} have the shape {array.shape}, not {shape}")
-            if name == "normals":
-                array = np.where(np.abs(array) < LEAST_COMPONENT, 0.0, array)
+            if name == "normals":  # PostgreSQL treats a product that underflows as an error
+                array = np.where(np.abs(array) < 1e-100, 0.0, array)
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         if len(self.points) == 0 or len(self.points) != len(self.normals):
@@ -131,30 +123,18 @@ class PointShell:
     ) -> "PointShell":
         """Make the shell of all parts of a mesh file together, or load a saved one.
 
-        Parameters
-        ----------
-        path : path
-            A mesh file, or a shell saved as `.npz`, loaded unchanged.
-        points : int, optional
-            Number of points, 1 to 10^7; 300 unless given. With a spacing, the greatest number;
-            200,000 unless given.
-        spacing : float, optional
-            Approximate distance of neighbours, metres; sets the number of points, at least 300.
-        unit : str, optional
-            Unit of a file without one; metres unless given.
-        seed : int
-            Random seed of the points: equal seeds give equal points.
-        inset : float
-            Distance by which the points are drawn inward, metres. Give the distance law's onset,
-            1.5 voxels, for contact that begins at the surface; 0 for points on it, to preserve
-            clearance. Thin walls, sharp edges and tips are drawn in as far as possible.
+        path : a mesh file, or a shell saved as `.npz`, loaded unchanged
+        points : number, 1 to 10^7; 300 unless given. With a spacing, the greatest number; 200,000
+            unless given.
+        spacing : approximate distance of neighbours, metres; sets the number, at least 300
+        unit : of a file without one; metres unless given
+        seed : random seed of the points: equal seeds give equal points
+        inset : distance by which the points are drawn inward, metres. Give the distance law's
+            onset, 1.5 voxels, for contact that begins at the surface; 0 for points on it, to
+            preserve clearance. Thin walls, sharp edges and tips are drawn in as far as possible.
 
-        Raises
-        ------
-        UsageError
-            Numbers out of range, or a unit for a saved shell, whose unit is the metre.
-        FileError
-            An unreadable file, or one without a surface.
+        Raises `UsageError` for numbers out of range, or a unit for a saved shell, whose unit is the
+        metre; `FileError` for an unreadable file, or one without a surface.
         """
         path = Path(path)
         if path.suffix.lower() == ".npz":
@@ -231,7 +211,7 @@ class PointShell:
         surface = orient(triangles)
         n_points = DEFAULT_POINTS if points is None else points
         if spacing is not None:
-            most = DENSE_POINTS if points is None else points
+            most = 200_000 if points is None else points  # these take a few seconds
             wanted = points_for(float(surface.areas.sum()), spacing)
             n_points = min(max(wanted, DEFAULT_POINTS), most)
         rng = np.random.default_rng(seed)
@@ -253,16 +233,10 @@ class PointShell:
         try:
             with Path(path).open("wb") as file:
                 np.savez(
-                    file,
-                    format=np.array(FORMAT),
-                    points=self.points,
-                    normals=self.normals,
-                    center=self.center,
-                    is_closed=np.array(self.is_closed),
-                    link=np.array(self.link),
-                    seed=np.array(self.seed),
-                    inset=self.inset,
-                )
+                    file, format=np.array(FORMAT), points=self.points, normals=self.normals,
+                    center=self.center, is_closed=np.array(self.is_closed),
+                    link=np.array(self.link), seed=np.array(self.seed), inset=self.inset,
+                )  # fmt: skip
         except OSError as error:
             raise FileError(f"{path}: cannot write the shell: {error.strerror}") from None
 
@@ -275,15 +249,9 @@ class PointShell:
                 if str(saved.get("format")) != FORMAT:
                     raise FileError(f"{path}: not a saved shell, or of another version")  # noqa: TRY301 - told as it is
                 return cls(
-                    saved["points"],
-                    saved["normals"],
-                    saved["center"],
-                    bool(saved["is_closed"]),
-                    str(saved["link"]),
-                    int(saved["seed"]),
-                    inset=saved["inset"],
-                    has_unit=True,
-                )
+                    saved["points"], saved["normals"], saved["center"], bool(saved["is_closed"]),
+                    str(saved["link"]), int(saved["seed"]), inset=saved["inset"], has_unit=True,
+                )  # fmt: skip
         except FileNotFoundError:
             raise FileError(f"{path}: no such file") from None
         except FileError:

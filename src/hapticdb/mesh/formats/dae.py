@@ -41,13 +41,7 @@ _Geometry = tuple[ET.Element, _Palette]
 _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 _PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons"}
 _OF_A_MESH = _PIECES | {"lines", "source", "vertices", "extra"}
-_UNREAD = "piece{s} of the kind '{kind}' {are} not read"
-_ROUNDED = 0.01
-"""Tolerated relative difference of a unit's length from that of its name. Larger: fewer are
-reported."""
 _LUMINANCE = (0.212671, 0.715160, 0.072169)  # of red, green and blue, by COLLADA 1.4.1
-_MOST_CONTROLLERS = 4
-"""Longest chain of controllers: a skin of a morph is two."""
 _INSTANCES: dict[str, tuple[str, ...]] = {
     "instance_geometry": ("geometry",),
     "instance_controller": ("controller",),
@@ -108,7 +102,7 @@ def _metres(root: ET.Element) -> tuple[float | None, list[str]]:
         return None, []
     name = unit.get("name", "")
     named = unit_length(name)
-    if named is None or abs(metres - named) <= _ROUNDED * named:
+    if named is None or abs(metres - named) <= 0.01 * named:
         return metres, []
     lengths = f"{named:.6g} m, and given as {metres:.6g} m, which is taken"
     return metres, [f"its unit is named '{name}', {lengths}; another --unit is taken instead"]
@@ -168,7 +162,7 @@ class _Document:
         inner: ET.Element | None = instance
         key, kinds = "url", _INSTANCES.get(instance.tag, ())
         bound: Floats | None = None
-        for _ in range(_MOST_CONTROLLERS):
+        for _ in range(4):  # a skin of a morph is two
             target = self.referred(inner, *kinds, key=key)
             if target is None or target.tag in {"geometry", "node"}:
                 return target, bound
@@ -219,8 +213,9 @@ class _Document:
         images = root.iterfind(".//image/init_from")  # with 'ref' or, as numbers, 'hex' since 1.5
         pictures = ((one.findtext("ref") or one.text or "").strip() for one in images)
         others = sum(1 for _ in root.iter("visual_scene")) - 1
+        unread = "piece{s} of the kind '{kind}' {are} not read"
         notes = [
-            *(note for kind, n in strange.items() for note in count_note(n, _UNREAD, kind=kind)),
+            *(note for kind, n in strange.items() for note in count_note(n, unread, kind=kind)),
             *count_note(outside, "geometr{ies} {are} not in its scene and {are} left out"),
             *count_note(missing, f"of its {len(wanted)} placements {{refer}} to what is not there"),
             *count_note(len(self._damaged), "transform{s} {are} damaged: parts there are left out"),

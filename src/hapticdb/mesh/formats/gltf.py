@@ -87,15 +87,8 @@ def parsed(content: bytes, path: Path, *, normals: bool = False) -> Parsed:
     meshes, materials = objects_of(tree, "meshes"), _base_colours(tree)
     return Parsed(
         shapes=[
-            _shape(
-                meshes[pose.mesh],
-                pose,
-                joints.get(pose.skin),
-                accessors,
-                materials,
-                normals=normals,
-            )
-            for pose in poses
+            _shape(meshes[one.mesh], one, joints.get(one.skin), accessors, materials, normals)
+            for one in poses
         ],
         placements=placements,
         metres=1.0,
@@ -195,8 +188,7 @@ def _shape(
     joints: NDArray[np.float64] | None,
     accessors: Accessors,
     materials: _Materials,
-    *,
-    normals: bool,
+    normals: bool,  # noqa: FBT001 - as of `parsed`
 ) -> Shape:
     """One shape of a mesh's primitives; shared vertices occur once."""
     vertices: dict[object, NDArray[np.generic]] = {}

@@ -25,7 +25,7 @@ _FACETS = ("IfcTessellatedItem", "IfcFacetedBrep")
 _CHORD = 1e-4
 """Greatest chord error unless given, metres. A bend of a pipe of 0.1 m (0.4 m across) has 22,000
 triangles and takes 0.2 s; at 1e-5 it has 220,000 and takes 42 s."""
-_END, _BYTES_OF_END = b"END-ISO-10303-21", 1024
+_END = b"END-ISO-10303-21"
 
 
 def read(path: Path, chord: float = _CHORD) -> Parsed:
@@ -53,7 +53,7 @@ def read(path: Path, chord: float = _CHORD) -> Parsed:
     notes = [note for what, n in excluded.items() for note in count_note(n, words, what=what)]
     words = "product{s} {are} left out: lines, or shapes that cannot be made"
     notes += count_note(len(products) - len(placed), words)
-    if _END not in path.read_bytes()[-_BYTES_OF_END:]:
+    if _END not in path.read_bytes()[-1024:]:
         notes.append(f"it seems cut short: '{_END.decode()}' does not stand at its end")
     notes += coarser_note(shapes, chord)
     return Parsed(shapes, placements, metres=1.0, up="z", notes=notes)

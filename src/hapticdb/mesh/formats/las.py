@@ -16,18 +16,13 @@ from hapticdb.units import length_text
 
 _MODEL, _LINEAR_UNIT, _VERTICAL_SYSTEM, _VERTICAL_UNIT = 1024, 3076, 4096, 4099
 """Ids of GeoTIFF keys."""
-_GEOGRAPHIC = 2
-_FULL_TURN = 360.0
-_LEAST = 1e-3
-"""Shortest plausible unit of a reference system, metres; the longest is 1 / this."""
 _NO_LENGTHS = (
     "which are no lengths: project it to a system in metres, for instance with PDAL's "
     "filters.reprojection, or name the unit (--unit) if its system is wrong"
 )
 _ENDS = np.iinfo(np.int32).min, np.iinfo(np.int32).max
 _MOST_STUCK = 0.01
-"""Share of a file's points that may be saturated at an end of the integers on an axis. A larger
-value accepts more lost positions."""
+"""Share of a file's points that may be saturated at an end of the integers on an axis."""
 _COARSE = 0.3
 """Step between coordinates, metres, from which on it is reported: whole metres, and whole feet."""
 _COLOURS = ("red", "green", "blue")
@@ -166,9 +161,9 @@ def _lengths(header: laspy.LasHeader) -> _Lengths:
         vertical = CRS.from_epsg(keys[_VERTICAL_SYSTEM]) if _VERTICAL_SYSTEM in keys else None
     except CRSError:
         system = vertical = None
-    if (system is not None and system.is_geographic) or keys.get(_MODEL) == _GEOGRAPHIC:
+    if (system is not None and system.is_geographic) or keys.get(_MODEL) == 2:
         name = "" if system is None else f" ({system.name})"
-        if np.abs([header.mins[:2], header.maxs[:2]]).max() > _FULL_TURN:
+        if np.abs([header.mins[:2], header.maxs[:2]]).max() > 360.0:
             return _Lengths(notes=(f"its system{name} is of degrees, which its numbers are not",))
         return _Lengths(not_lengths=f"its coordinates are degrees{name}, {_NO_LENGTHS}")
     by_code = {
@@ -179,7 +174,7 @@ def _lengths(header: laspy.LasHeader) -> _Lengths:
     metres = by_code.get(
         keys.get(_LINEAR_UNIT, 0), axes[0].unit_conversion_factor if axes else None
     )
-    if metres is None or not _LEAST <= metres <= 1 / _LEAST:
+    if metres is None or not 1e-3 <= metres <= 1e3:
         return _Lengths(notes=("the unit of its reference system cannot be read",))
     heights = [*axes[2:3], *([] if vertical is None else vertical.axis_info[:1])]
     height = heights[-1].unit_conversion_factor if heights else metres

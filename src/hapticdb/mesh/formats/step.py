@@ -23,8 +23,6 @@ _END = "END-ISO-10303-21"
 _NO_END = f"it seems cut short: '{_END}' does not stand at its end"
 _FINE = 1e-5
 """Step between 32-bit positions that does no harm, as a share of the extent."""
-_SAME = 1e-5
-"""Greatest relative difference of a length from that of a known unit."""
 
 
 def read(path: Path, chord: float = DEFAULT) -> Parsed:
@@ -101,7 +99,7 @@ def _nearer(found: Parsed, text: str, path: Path, chord: float) -> Parsed:
     step = np.spacing(np.float32(np.abs(before).max()))
     along = np.abs(middle).argmax()
     length = (before - after)[0, along] / middle[along] if middle[along] else 0.0
-    metres = next((unit for unit in UNITS.values() if abs(length - unit) <= _SAME * unit), 0.0)
+    metres = next((unit for unit in UNITS.values() if abs(length - unit) <= 1e-5 * unit), 0.0)
     if before.shape != after.shape or np.abs(before - after - metres * middle).max() > 4 * step:
         return found  # `clean` reports the loss
     offset = np.eye(4)

@@ -41,8 +41,6 @@ _METRES = {
     "meter": 1.0,
 }
 _PIECE = 1 << 20
-_MOST_KINDS = 3
-"""Kinds of elements listed in a note about an extension."""
 _HARMLESS = re.compile("/(material|production|trianglesets)/")
 _KNOWN = re.compile(f"{_HARMLESS.pattern}|/(beamlattice|slice)/")
 """Also extensions without effect on meshes, reported as unread. A model that requires another one
@@ -104,7 +102,7 @@ class _Model:
             words = "object{s} {are} of the type {kind}, and {come} in like any other"
             notes += count_note(n, words, kind=kind)
         for extension, elements in self.unread.items():
-            most = ", ".join(f"{n} {kind}" for kind, n in elements.most_common(_MOST_KINDS))
+            most = ", ".join(f"{n} {kind}" for kind, n in elements.most_common(3))
             notes.append(f"its extension {extension} is not read: {most}")
         return notes
 

@@ -48,13 +48,8 @@ _NO_SHAPE = {
     "hole", "scrv", "sp", "end", "con", "ctech", "stech",
 }  # fmt: skip
 _PICTURES = {"map_kd", "map_d", "map_ka"}
-_OUTSIDE = -1
-_WITH_COLOUR = 6
-"""Least count of numbers on a vertex line with a colour."""
 MOST_BYTES = 16 << 20
-"""Bytes of a material file, read up to this. A larger value may take more memory."""
-_MOST_WORDS, _LONGEST_WORD = 3, 20
-"""Unknown words listed in a note, and their characters."""
+"""Bytes of a material file, read up to this."""
 
 
 @dataclass
@@ -102,7 +97,7 @@ def read(path: Path) -> Parsed:
         elif word[:1] == "#":
             comments.append(line)
         elif word not in _NO_SHAPE:
-            strange[word[:_LONGEST_WORD]] += 1
+            strange[word[:20]] += 1
     vertices = positions(vertex_lines)
     palette: dict[str, Colours] = {}
     pictures: list[str] = []
@@ -116,7 +111,7 @@ def read(path: Path) -> Parsed:
         ("/".join(filter(None, names)) or path.stem, _coloured(group, vertices, palette, painted))
         for names, group in groups.items()
     )
-    most = ", ".join(f"'{word}' {n}" for word, n in strange.most_common(_MOST_WORDS))
+    most = ", ".join(f"'{word}' {n}" for word, n in strange.most_common(3))
     words = "line{s} {begin} with unknown words and {are} passed over: {most}"
     missing = missing_note(path.parent, pictures, *unread)
     return placed_once(
@@ -154,7 +149,7 @@ def _materials(content: str, pictures: list[str]) -> Iterator[tuple[str, Colours
 
 def _painted(lines: list[str]) -> Colours | None:
     """Colours (V, 4) after the coordinates of vertices; None unless all have one."""
-    words = [line.split()[3:6] for line in lines if len(line.split()) >= _WITH_COLOUR]
+    words = [line.split()[3:6] for line in lines if len(line.split()) >= 6]
     if not lines or len(words) != len(lines):
         return None
     try:
@@ -211,4 +206,4 @@ def _polygon(line: str, n_before: int) -> list[int]:
     """Corners of one face, 0-based; a negative index counts back from its own line."""
     found = [n + n_before + 1 if n < 0 else n for n in indices(line.split())]
     # An index that is still not above 0 is out of range, whether it was absolute or relative.
-    return [n - 1 if 0 < n < 2**62 else _OUTSIDE for n in found]
+    return [n - 1 if 0 < n < 2**62 else -1 for n in found]

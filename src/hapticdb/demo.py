@@ -35,8 +35,6 @@ from hapticdb.units import length_text
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"
 """The paper's point query sequence, the reference of the comparison."""
-WARM_POSES = 20
-"""Untimed poses of each strategy. More take longer and change little."""
 
 
 class Imported(NamedTuple):
@@ -116,13 +114,9 @@ class Comparison:
 
 
 def prepare(
-    folder: str | os.PathLike[str],
-    *,
-    bits: int = 10,
-    frames: int = 1000,
-    points: int = 300,
+    folder: str | os.PathLike[str], *, bits: int = 10, frames: int = 1000, points: int = 300,
     progress: ImportCallback | None = None,
-) -> DemoScene:
+) -> DemoScene:  # fmt: skip
     """Write the sample and import it on bricks.
 
     folder : of all files; bits : of an axis of the grid; frames : poses of the path; points : of
@@ -197,7 +191,7 @@ def _race(
 ) -> dict[Strategy, list[Query]]:
     """Queries of each strategy; the first strategy's results become the `reference`."""
     for strategy in COMPARED:
-        for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
+        for pose in scene.poses[:: max(1, len(scene.poses) // 20)]:
             env.touch(scene.shell, pose, strategy, law="plane")
     queries: dict[Strategy, list[Query]] = {strategy: [] for strategy in COMPARED}
     for index, pose in enumerate(scene.poses):

@@ -46,13 +46,9 @@ class CopyReport:
 
 
 def copy_environment(
-    source_url: Url,
-    target_url: Url,
-    *,
-    layout: Layout | None = None,
-    curve: CurveName | None = None,
-    progress: Progress | None = None,
-) -> CopyReport:
+    source_url: Url, target_url: Url, *, layout: Layout | None = None,
+    curve: CurveName | None = None, progress: Progress | None = None,
+) -> CopyReport:  # fmt: skip
     """Copy an environment's objects into another, made if it does not exist.
 
     Each object is copied in one transaction, with its id if that is free, its surface, and its

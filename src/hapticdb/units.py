@@ -43,7 +43,8 @@ _VOLUMES = ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³"))
 
 def length_text(length: float) -> str:
     """A length, metres, in a readable unit: ``3.3 mm``, ``4.21 m``, ``12.5 km``."""
-    size, word = readable_unit(length)
+    found = (pair[:2] for pair in _READABLE if length >= pair[2] * pair[0])
+    size, word = next(found, (1e-6, "µm"))
     return f"{length / size:.4g} {word}"
 
 
@@ -59,14 +60,6 @@ def notebook_html(result: object, rows: Iterable[Iterable[object]]) -> str:
     cells = ("".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows)
     table = "".join(f"<tr>{row}</tr>" for row in cells)
     return f"<b>{escape(repr(result))}</b><table>{table}</table>"
-
-
-def readable_unit(length: float) -> tuple[float, str]:
-    """Metres of the most readable unit for a length, metres, and its sign."""
-    for size, sign, least in _READABLE:
-        if length >= least * size:
-            return size, sign
-    return 1e-6, "µm"
 
 
 def length_of(text: str, unit: str) -> float:

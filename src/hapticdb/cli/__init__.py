@@ -36,9 +36,6 @@ from hapticdb.tabular.tables import printable
 __all__ = ["app", "main"]
 
 USER_ERROR = 2
-UNFORESEEN = 1
-INTERRUPTED = 130
-PIPE_CLOSED = 141
 
 VERBS = (
     import_, info, objects, touch, feel, view, serve, replay, sweep, clashes, distance, extract,
@@ -62,10 +59,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
     except (BrokenPipeError, PipeClosedError):
         _close_stdout()
-        return PIPE_CLOSED
+        return 141
     except (KeyboardInterrupt, Interrupted) as error:
         interrupting.leave()  # a further Ctrl-C would print another line
-        return _fail(str(error) or "interrupted", INTERRUPTED)
+        return _fail(str(error) or "interrupted", interrupting.EXIT_CODE)
     except HapticDBError as error:
         return _fail(str(error), USER_ERROR, show_trace=is_debugging)
     except Exception as error:  # noqa: BLE001 - a user sees one line, whatever happened
@@ -74,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         cause = str(error).partition("\n")[0] or "no message"
         hint = "" if is_debugging else "; 'hapticdb --debug ...' shows where"
         message = f"{type(error).__name__}: {cause}{hint}"
-        return _fail(message, UNFORESEEN, show_trace=is_debugging)
+        return _fail(message, 1, show_trace=is_debugging)
     return code if isinstance(code, int) else 0
 
 

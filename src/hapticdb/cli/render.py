@@ -34,8 +34,8 @@ NARROW = 12
 """Least width of a shortened text, columns."""
 MOST_ROWS = 20
 """Rows of a long table; further ones are counted below it."""
-GAP, NARROW_GAP, FACTS_GAP = 3, 1, 2
-"""Blanks between two columns of a table, of a shortened one, and between a name and its value."""
+GAP = 3
+"""Blanks between two columns of a table; 1 of a shortened one."""
 
 
 def note(text: str) -> None:
@@ -120,7 +120,7 @@ def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None
 def facts(rows: Iterable[tuple[str, str]]) -> None:
     """Print names and values, a pair a line; on a terminal long values are wrapped."""
     pairs = [(_cut(one_line(name), _room() // 2), one_line(value)) for name, value in rows]
-    indent = max(_width_of(name) for name, _ in pairs) + FACTS_GAP
+    indent = max(_width_of(name) for name, _ in pairs) + 2
     room = max(_room() - indent, NARROW)
     for name, value in pairs:
         lines = textwrap.wrap(value, room) if len(value) > room else [value]
@@ -149,7 +149,7 @@ def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool]) -> list[str]:
     cells = [[*map(one_line, row)] for row in rows]
     widths = [max(map(_width_of, column)) for column in zip(*cells, strict=True)]
     texts = [n for n, is_number in enumerate(numbers) if not is_number and widths[n] > NARROW]
-    gap = GAP if sum(widths) + GAP * (len(widths) - 1) + 2 <= _room() else NARROW_GAP
+    gap = GAP if sum(widths) + GAP * (len(widths) - 1) + 2 <= _room() else 1
     room = _room() - 2 - gap * (len(widths) - 1)
     while sum(widths) > room and texts and max(widths[n] for n in texts) > NARROW:
         widths[max(texts, key=widths.__getitem__)] -= 1

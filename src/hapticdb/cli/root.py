@@ -80,27 +80,11 @@ def exit_by(signals: Sequence[int], after: str = "") -> None:
         raise Interrupted(f"ended by Ctrl-C{after}")
 
 
-def _show_version(*, wanted: bool) -> None:
-    if wanted:
-        from hapticdb import __version__
-
-        print(f"hapticdb {__version__}")
-        raise typer.Exit
-
-
 @app.callback(invoke_without_command=True)
 def root(
     context: typer.Context,
     *,
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version",
-            callback=lambda wanted: _show_version(wanted=wanted),
-            is_eager=True,
-            help="Print the version.",
-        ),
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")] = False,
 ) -> None:
     """Feel a virtual environment too large for memory: haptic queries on an SQL database.
@@ -117,7 +101,12 @@ def root(
 
     'hapticdb VERB --help' explains a verb and its options, with an example.
     """  # noqa: D301 - the help text's mark of lines that stay as they are
-    del version, debug  # seen by their callbacks and by `main`
+    del debug  # `main` reads it
+    if version:
+        from hapticdb import __version__
+
+        print(f"hapticdb {__version__}")
+        raise typer.Exit
     if context.invoked_subcommand is None:
         print(context.get_help())
 

@@ -95,11 +95,9 @@ def _show_loops(report: "Report") -> None:
         ("rate, Hz", *(f"{loop.rate:,.1f}" for loop in loops)),
         ("missed deadlines", *(f"{loop.missed:,}" for loop in loops)),
     ]
-    for what, spreads in (
-        ("late", [loop.lateness for loop in loops]),
-        ("computing", [loop.elapsed for loop in loops]),
-    ):
+    for what, times in (("late", "lateness"), ("computing", "elapsed")):
         for name, field in PERCENTILES.items():
+            spreads = (getattr(loop, times) for loop in loops)
             figures = (f"{1e6 * getattr(spread, field):,.1f}" for spread in spreads)
             rows.append((f"{what} {name}, µs", *figures))
     render.table(("", "session>", "empty loop>")[: 1 + len(loops)], rows)
@@ -144,16 +142,12 @@ def _force_facts(report: "Report") -> Facts:
 
 def inside_text(report: "Report", cells: "ResidentCells") -> str:
     """Sentence on the time of the tool inside objects, without force."""
-    frames = report.inside_frames
-    start = (
-        "it began inside"
-        if report.first_inside_frame == 0
-        else f"from second {report.first_inside_frame / report.rate:.3g} on it was inside"
-    )
+    frames, first = report.inside_frames, report.first_inside_frame
+    start = f"from second {first / report.rate:.3g} on it was" if first else "it began"
     inside = _in_objects(cells, report.enclosing_objects)
     end = "it never came free" if report.ended_inside else "until it was free"
     counted = render.counted(frames, "frame")
-    return f"{start} {inside}: no force for {counted} ({frames / report.rate:.3g} s), {end}"
+    return f"{start} inside {inside}: no force for {counted} ({frames / report.rate:.3g} s), {end}"
 
 
 class Notes:

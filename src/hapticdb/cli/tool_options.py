@@ -40,14 +40,9 @@ class ToolOptions:
 
 
 def tool_of(
-    tool: str,
-    unit: str | None,
-    points: int | None,
-    seed: int | None,
-    inset: float = 0.0,
-    *,
+    tool: str, unit: str | None, points: int | None, seed: int | None, inset: float = 0.0, *,
     has_surface: bool = False,
-) -> "Tool":
+) -> "Tool":  # fmt: skip
     """Tool of a file, with notes on its defects; points, seed : as given, None if not.
 
     inset : inward offset of its points, metres, without effect on a saved shell; has_surface :

@@ -10,10 +10,8 @@ Floats = NDArray[np.float64]
 
 TOWARDS, SUN = (0.50, 0.76, 0.44), (0.30, 0.45, 0.84)
 """Directions to the eye and to the light, as for `turned`."""
-DEPTH = 1.5
-"""Half depth of the view, in half diagonals of the boxes; surfaces outside are clipped."""
 SAMPLES = 2
-"""Samples for each pixel, an axis. More: smoother edges, more time."""
+"""Samples for each pixel, an axis."""
 
 GROWTH = 1.5
 """Greatest ratio of the widths, or heights, of triangles in one batch."""
@@ -45,7 +43,8 @@ class Canvas:
         low, high = (corners @ self._axes.T).min(axis=0), (corners @ self._axes.T).max(axis=0)
         self._scale = float(((window[1] - window[0]) / (high - low)[:2]).min())
         self._shift = np.append(window.mean(axis=0), 0.0) - 0.5 * (low + high) * self._factors
-        reach = DEPTH * 0.5 * float(np.linalg.norm(np.ptp(corners, axis=0)))
+        # half depth of the view; surfaces outside are clipped
+        reach = 0.75 * float(np.linalg.norm(np.ptp(corners, axis=0)))
         self._size = size
         self._depths = np.full((size[1] * SAMPLES, size[0] * SAMPLES), reach, np.float32)
         self._nearest = -reach

@@ -25,10 +25,6 @@ BASE, TOP = 970, 810
 """Rows of no force and of the greatest one."""
 PAPER, INK, BODY = "#e9edf3", "#242c38", "#9eb5cf"
 TOOL, FREE, FORCE = "#2bb5a0", "#3aa05c", "#eb6814"
-OUT = 0.45
-"""Share of the removal path at which the trunk lid is drawn."""
-TOOLS_SHOWN = 9
-"""Number of poses with a picture of the tool."""
 LEFT, LINE = 35, 26
 """Pixels from the edge to the words, and from one line to the next."""
 
@@ -63,7 +59,7 @@ def _scene(scene: "DemoScene", found: "Answers") -> Canvas:
         parts = [(obj, part) for obj, part in parts_of(env.store, objects)]
     boxes = np.array([obj.bounds for obj in objects])
     canvas = Canvas(boxes, SCENE, np.array(WINDOW, float), _rgb(PAPER), up_axis(objects))
-    shift = OUT * (found.lid[-1, :3, 3] - found.lid[0, :3, 3])
+    shift = 0.45 * (found.lid[-1, :3, 3] - found.lid[0, :3, 3])
     for obj, part in parts:
         triangles = part.surface()
         tints = np.tile(_rgb(BODY), (len(triangles), 1))
@@ -73,7 +69,7 @@ def _scene(scene: "DemoScene", found: "Answers") -> Canvas:
             tints = part.colours[:, :3] / 255.0
         canvas.fill(triangles, tints)
     tool = np.concatenate([part.triangles() for part in read_file(scene.files.spanner).parts])
-    for index in np.linspace(0, len(scene.poses) - 1, TOOLS_SHOWN).astype(int):
+    for index in np.linspace(0, len(scene.poses) - 1, 9).astype(int):
         pose = scene.poses[index]
         canvas.fill(tool @ pose[:3, :3].T + pose[:3, 3], _rgb(TOOL))
     return canvas

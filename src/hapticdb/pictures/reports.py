@@ -27,8 +27,7 @@ from hapticdb.verdicts import Kind
 MOST_LINES = 100
 """Pairs of a group in a report, at most; the others are counted."""
 MOST_SNAPSHOTS = 100
-"""Topics of a BCF file with a picture, the gravest. More: a larger file, and a tenth of a second
-each."""
+"""Topics of a BCF file with a picture, a tenth of a second each, the gravest."""
 GUIDS = uuid.UUID("5e2f6d4c-1f0b-5b53-9d0e-6a2b8f1c7a90")
 """Namespace of the GUIDs of topics; with another one, all topics are new to other tools."""
 GLOBAL_ID = re.compile(r"[0-9A-Za-z_$]{22}")

@@ -25,13 +25,9 @@ KINDS = {
 
 
 def copy(
-    source: str,
-    target: str,
-    *,
-    layout: LayoutName | None = None,
-    curve: CurveName | None = None,
+    source: str, target: str, *, layout: LayoutName | None = None, curve: CurveName | None = None,
     output: Output,
-) -> None:
+) -> None:  # fmt: skip
     """Copy to another engine, layout or curve.
 
     Every object is copied in a transaction of its own, with its id: after an interruption, run the

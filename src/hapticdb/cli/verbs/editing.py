@@ -9,13 +9,9 @@ from hapticdb.tabular.schema import OBJECT, record
 
 
 def move(
-    url: str,
-    objects: list[str],
-    *,
-    translate: Point | None = None,
-    matrix: str | None = None,
+    url: str, objects: list[str], *, translate: Point | None = None, matrix: str | None = None,
     output: Output,
-) -> None:
+) -> None:  # fmt: skip
     """Move objects.
 
     --translate shifts all chosen objects in one transaction: all or none of them move, even if the

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from hapticdb.extraction.extraction_results import Extraction
 
 MOST_BLOCKERS = 10
-"""Rows of the table of blockers, and of the table of failed searches."""
+"""Rows of the tables of blockers and of failed searches."""
 
 HELP = f"""Search a path on which parts come out.
 
@@ -132,12 +132,8 @@ def extract(
         with render.bar("pulling", "searches" if order.on else "pulls") as progress:
             options |= {"where": chosen.where, "progress": progress}
             if order.disassemble:
-                more: dict[str, Any] = {
-                    "exclude": selection.exclude or (),
-                    "keep": kept,
-                    "on": order.on,
-                }
-                found = disassemble(env, *ids, **more, **options)
+                excluded = selection.exclude or ()
+                found = disassemble(env, *ids, exclude=excluded, keep=kept, on=order.on, **options)
                 steps = [(step.found, step.excluded) for step in found.steps if found.is_found]
             else:
                 found = search_path(env, *ids, exclude=chosen.exclude, **options)

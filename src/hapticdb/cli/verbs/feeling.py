@@ -25,11 +25,8 @@ if TYPE_CHECKING:
     from hapticdb.session.report import Report
     from hapticdb.session.session import Session
 
-POLL_EVERY, OBJECTS_EVERY = 0.1, 3
-"""Seconds between two polls of the session, the delay of the notes on a lost database or an ended
-recording; and polls between two checks for a tool inside an object: it may be there briefly."""
-CONTACT_STIFFNESS = 1000.0
-"""Default stiffness of a contact with direct rendering, N/m."""
+POLL_EVERY = 0.1
+"""Seconds between two polls of the session: delay of its notes."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ class ForceOptions:
             delay = None if self.delay is None else 1e-3 * self.delay
             return None, Coupling(self.stiffness, self.cap, delay=delay, profile=self.profile)
         refuse("with --rendering direct", self, "delay")
-        stiffness = CONTACT_STIFFNESS if self.stiffness is None else self.stiffness
+        stiffness = 1000.0 if self.stiffness is None else self.stiffness
         law = law_named(self.law or "distance", stiffness)
         return law, Coupling(cap=self.cap, profile=self.profile)
 
@@ -177,7 +174,8 @@ def _waited_for(session: "Session", stiffness: float | None, seconds: float | No
             report = session.wait(POLL_EVERY)
             notes.poll(session)
             n_queries += 1
-            if n_queries % OBJECTS_EVERY == 0 or report is not None:
+            # a tool may be inside an object briefly
+            if n_queries % 3 == 0 or report is not None:
                 notes.report_objects(session)
             if progress is not None:
                 progress(session.n_frames / session.timing.rate, round(seconds or 0.0))

@@ -22,9 +22,6 @@ from hapticdb.units import length_text
 if TYPE_CHECKING:
     from hapticdb.ingest.files import FileReport, ImportOptions
 
-COARSE, FINE_ENOUGH, TINY = 1.0, 0.5, 1e-8
-"""Voxel sizes, metres: a note reports those above `COARSE`, with the bits for `FINE_ENOUGH`, and
-those below `TINY`."""
 MOST_BITS = 21
 
 
@@ -141,12 +138,12 @@ def _print_reports(
 
 
 def _warn_of_voxels(size: float, bits: int) -> None:
-    """Note voxels too coarse or too fine for parts, with the option to change."""
-    if size > COARSE and bits < MOST_BITS:
-        more = min(bits + ceil(log2(size / FINE_ENOUGH)), MOST_BITS)
+    """Note voxels above 1 m, with the bits for half a metre, and below 10 nm."""
+    if size > 1.0 and bits < MOST_BITS:
+        more = min(bits + ceil(log2(size / 0.5)), MOST_BITS)
         finer = length_text(size / 2 ** (more - bits))
         render.note(f"voxels of {length_text(size)} are coarse: --bits {more} makes them {finer}")
-    elif size < TINY:
+    elif size < 1e-8:
         render.note(f"voxels of {1e9 * size:.3g} nm: is --unit right?")
 
 
@@ -163,10 +160,7 @@ def _lines(file: str, report: "FileReport") -> list[str]:
             (report.present, "were there already"),
             (report.replaced, "replaced"),
             (report.dropped, "removed, which the file has no more"),
-            (
-                report.restored,
-                "of them had been removed and are back: --keep-removed omits them",
-            ),
+            (report.restored, "of them had been removed and are back: --keep-removed omits them"),
         ):
             line += f"; {count} {words}" if count else ""
     if report.still_removed:

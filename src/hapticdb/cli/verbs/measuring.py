@@ -29,9 +29,8 @@ def distance(url: str, a: str, b: str, *, output: Output) -> None:
 
 def _show(found: "Distance") -> None:
     length = length_text(found.at_most)
-    apart = f"are {length} apart" if found.at_least else "meet"
-    if found.at_most and not found.at_least:
-        apart = f"meet, or are {length} apart at most"
+    least = f"meet, or are {length} apart at most" if found.at_most else "meet"
+    apart = f"are {length} apart" if found.at_least else least
     render.say(f"{found.a.name} and {found.b.name} {apart}")
     facts = [
         (f"on {obj.name}", f"{place_text(place.tolist(), 1e-6)} m")

@@ -191,13 +191,9 @@ def _pair(text: str, option: str) -> "tuple[Role, str]":
 
 
 def _run(
-    serving: "Serving",
-    ready: Callable[[int], None],
-    seconds: float | None,
-    *,
-    log_json: bool,
+    serving: "Serving", ready: Callable[[int], None], seconds: float | None, *, log_json: bool,
     is_quiet: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     import asyncio
     import logging
 

@@ -55,11 +55,7 @@ def listening(serving: Serving) -> socket.socket:
         ) from None
 
 
-async def run(
-    serving: Serving,
-    ready: Callable[[int], None],
-    stop: asyncio.Event,
-) -> None:
+async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Event) -> None:
     """Serve until `stop` is set; then shut down in order, so that no recording is lost.
 
     First the server refuses connections and closes the browsers'; then the page ends its sessions;

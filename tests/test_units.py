@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from hapticdb.cli.options import command
 from hapticdb.cli.values import point_of
 from hapticdb.errors import UsageError
 from hapticdb.mesh import parse_in_process, read_file
-from hapticdb.units import length_of, place_text, volume_of, volume_text
+from hapticdb.units import angle_of, length_of, place_text, volume_of, volume_text
 from mesh_files import COLLADA
 
 FEET = 1200.0 / 3937.0
@@ -226,6 +227,15 @@ def test_what_is_no_length_is_refused_with_the_forms_that_are_taken(text: str) -
         length_of(text, "mm")
 
 
+def test_angle_of_units() -> None:
+    for text in ("60", "60deg", "60 deg", "6e1"):
+        assert angle_of(text) == 60.0
+    assert angle_of("-1rad") == -math.degrees(1.0)
+    for text in ("", "60mm", "deg", "nan", "1,5", "60degrees"):
+        with pytest.raises(hapticdb.errors.UsageError, match=r"give degrees, or such as 1\.05rad"):
+            angle_of(text)
+
+
 def test_three_lengths_have_units_of_their_own_or_the_last_ones() -> None:
     inch = 0.0254
     assert point_of("1,-2 0.5", "m") == (1, -2, 0.5)
@@ -238,13 +248,16 @@ def test_three_lengths_have_units_of_their_own_or_the_last_ones() -> None:
             point_of(text, "m")
 
 
+NO_LENGTHS = {"VOLUME", "SIZE", "ANGLE"}
+
+
 def test_every_length_among_the_options_shows_its_default_and_takes_a_unit() -> None:
     """Defaults of verbs are metres, those in the help are in the option's unit."""
     found = set()
     for verb in VERBS:
         for name, one in inspect.signature(command(verb)).parameters.items():
             option = getattr(one.annotation, "__metadata__", [None])[0]
-            if not getattr(option, "parser", None) or option.metavar in {"VOLUME", "SIZE"}:
+            if not getattr(option, "parser", None) or option.metavar in NO_LENGTHS:
                 continue
             found.add(name)
             text = "1,2,25.4" if option.metavar == "X,Y,Z" else "25.4"

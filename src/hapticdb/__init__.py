@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment as Environment
     from hapticdb.environment import create as create
     from hapticdb.environment import open as open  # noqa: A004 - as in tarfile.open
+    from hapticdb.exact.reach import Reached as Reached
+    from hapticdb.exact.reach import reach as reach
     from hapticdb.exact.sweep import sweep as sweep
     from hapticdb.exact.swept import Swept as Swept
     from hapticdb.extraction.disassembly import Disassembly as Disassembly

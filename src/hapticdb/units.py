@@ -76,6 +76,15 @@ def length_of(text: str, unit: str) -> float:
     return float(Decimal(match[1]) * Decimal(repr(own)))
 
 
+def angle_of(text: str) -> float:
+    """Degrees of an angle: a number in degrees, or with a unit, ``60deg``, ``1.05 rad``."""
+    match = _LENGTH.fullmatch(text.strip())
+    own = {"deg": 1.0, "rad": 180.0 / math.pi}.get(match[2] or "deg") if match else None
+    if match is None or own is None:
+        raise UsageError(f"{text[:80]!r} is no angle: give degrees, or such as 1.05rad")
+    return float(match[1]) * own
+
+
 def volume_of(text: str) -> float:
     """Cubic metres of a volume: cubic centimetres, or with a unit, as ``5mm3``; `UsageError`."""
     bare = re.sub(r"(?<=[a-zµ])(\^?3|³)$", "", text.strip(), flags=re.IGNORECASE)

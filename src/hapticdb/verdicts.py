@@ -49,10 +49,12 @@ class PathVerdict(StrEnum):
     HITS = "hits", 1, "a surface is met, or the tool starts inside an object"
     NO_PATH = "no way found", 1, "no proof that there is none"
     NO_ORDER = "no order found", 1, "no proof that there is none"
+    NOT_REACHABLE = "not reachable", 1, "each placement of the tool is blocked"
     NOT_DECIDED = "not decided", 3, "the time was over, or a chord error is too large"
     OVERLAPS = "overlaps", 4, "nothing else is hit, but it overlaps others at the start"
     CLEAR = "clear", 0, "nothing is hit"
     SLIDES = "slides", 0, "nothing is hit, but it moves in contact"
+    REACHABLE = "reachable", 0, "a placement of the tool is free"
     COMES_OUT = "comes out", 0, "nothing is hit, nor touched at the end of the path"
 
     def __new__(cls, text: str, exit_status: int, line: str) -> Self:
@@ -79,6 +81,7 @@ SWEEP_VERDICTS = (
     PathVerdict.HITS,
 )  # fmt: skip
 EXTRACT_VERDICTS = (PathVerdict.COMES_OUT, *SWEEP_VERDICTS[1:-1], PathVerdict.NO_PATH)
-"""Verdicts of sweeps, and of extractions and disassemblies."""
+REACH_VERDICTS = (PathVerdict.REACHABLE, PathVerdict.NOT_DECIDED, PathVerdict.NOT_REACHABLE)
+"""Verdicts of sweeps, of extractions and disassemblies, and of tools' reach."""
 WORST = tuple(dict.fromkeys(verdict.exit_status for verdict in PathVerdict))
 """Exit statuses, the worst first: a batch has the first of them among its sweeps."""

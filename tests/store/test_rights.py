@@ -360,6 +360,7 @@ def lines(url: str) -> dict[str, list[str]]:
         "feel": [url, *by, "--device", "path.csv", "--seconds", "0.2", "--record", "felt.hdbrec"],
         "replay": ["felt.hdbrec", url],
         "sweep": [url, *by, "--path", "path.csv"],
+        "reach": [url, "1", *by, "--axis", "0,0,1", "--step", "180"],
         "move": [url, "1", "--translate", "0,0,0.01"],
         **{verb: [url, "copy.db"] for verb in ("copy", "diff")},
         "grant": [url, "pg_monitor", "--as", "viewer"],

@@ -25,6 +25,7 @@ from hapticdb.cli.verbs.importing import import_
 from hapticdb.cli.verbs.listing import info, objects
 from hapticdb.cli.verbs.maintenance import backup, check, grant
 from hapticdb.cli.verbs.measuring import distance
+from hapticdb.cli.verbs.reaching import reach
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample
 from hapticdb.cli.verbs.serving import serve, view
@@ -38,8 +39,8 @@ __all__ = ["app", "main"]
 USER_ERROR = 2
 
 VERBS = (
-    import_, info, objects, touch, feel, view, serve, replay, sweep, clashes, distance, extract,
-    move, remove, copy, diff, check, backup, grant, demo, sample,
+    import_, info, objects, touch, feel, view, serve, replay, sweep, reach, clashes, distance,
+    extract, move, remove, copy, diff, check, backup, grant, demo, sample,
 )  # fmt: skip
 """Verbs, as listed; their docstrings are their help texts."""
 HIDDEN = {sample}

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import typer
 
 from hapticdb.cli.values import point_of, size_of
-from hapticdb.units import NAMES, length_of, volume_of
+from hapticdb.units import NAMES, angle_of, length_of, volume_of
 
 StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 CurveName = Literal["z", "hilbert", "lexicographic"]
@@ -154,6 +154,15 @@ sweep.envelope_voxel LENGTH/mm [2 million in the path's box]: edge of its voxels
 sweep.replace: Replace an envelope of this name.
 sweep.until_hit: End at the first hit on the path: faster.
 
+reach.axis X,Y,Z [the target's axis of symmetry, from both ends]: Outward direction of the axis.
+reach.approach [-z]: Direction in which the tool moves onto the target, tool's frame.
+reach.about X,Y,Z/mm [its origin]: the tool's point on the target's end face, tool's frame.
+reach.offset LENGTH/mm [0]: so far outward of the end face.
+reach.lift LENGTH/mm [20]: way of the tool onto the target, and off it.
+reach.turn ANGLE [60]: Degrees, or such as 1.05rad: turn on the target, by the right-hand rule.
+reach.step ANGLE [15]: Degrees, or such as 0.1rad: from one placement to the next.
+reach.seconds S [no limit]: Time of all targets.
+
 clashes.within LENGTH/mm [1]: pairs that are so near are told.
 clashes.contact LENGTH/mm [0.05]: surfaces so near, or so little one in the other, touch.
 clashes.of WORDS: One of each pair.
@@ -221,7 +230,9 @@ demo.points N: Points of the tool.
 """Texts by name, or by verb and name: ``name VALUE [default]: help``. VALUE is absent from flags
 and choices. A length is read in the unit after its slash unless it has its own; its verb gets
 metres."""
-SIZES: dict[str | None, Callable[[str], object]] = {"VOLUME": volume_of, "SIZE": size_of}
+SIZES: dict[str | None, Callable[[str], object]] = {
+    "VOLUME": volume_of, "SIZE": size_of, "ANGLE": angle_of
+}  # fmt: skip
 """Parsers by placeholders."""
 _ALSO = {"serve": "view", "sample": "demo", "demo": "sample"}
 """Verbs with the texts of another verb as well."""

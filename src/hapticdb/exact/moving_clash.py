@@ -16,8 +16,7 @@ from hapticdb.exact.clash import classify_pair
 from hapticdb.exact.distance import Pair, box_gaps
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import CONTACT
-from hapticdb.exact.sweep import center_of
-from hapticdb.ingest.geometry import parts_of
+from hapticdb.exact.sweep import center_of, shapes_of
 from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.tool_surface import ToolSurface
@@ -93,10 +92,7 @@ def find_meetings(
         gaps = box_gaps(tool, path, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
         found: list[Meeting] = []
-        for n, (obj, part) in enumerate(parts_of(env.store, near)):
-            still = CollisionShape(
-                part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord, index=part.faces
-            )
+        for n, (obj, still) in enumerate(shapes_of(env.store, near)):
             for parameters in _intervals(Pair(still.tree, tool, path), contact):
                 kind, depth, place = _gravest(
                     still, tool, path.at(np.linspace(*parameters, POSES)), contact

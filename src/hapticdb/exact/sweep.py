@@ -4,7 +4,7 @@ Broad phase: the objects' boxes, never too few of them. Narrow phase: their surf
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -20,11 +20,10 @@ from hapticdb.exact.separation import CONTACT, SAME, Separation
 from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.triangles.path_distance import MEETING
-from hapticdb.mesh import Part
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.pointshell.tool_surface import ToolSurface
-from hapticdb.store.base import Object, Progress
+from hapticdb.store.base import Object, Progress, Store
 from hapticdb.store.finding import Words
 
 FIRST_SHARE, LATER = 1 / 64, 4.0
@@ -98,14 +97,39 @@ def swept_along(
     where: Words, exclude: Words, pairs: Sequence["LinkPair"] = (),
 ) -> Swept:  # fmt: skip
     """Sweep rigid bodies, and pairs of them, along one path."""
+
+    def swept() -> Swept:
+        with env.store.snapshot():
+            objects = env.select(where, exclude)
+            return PathSweep(env, path, movers, request).swept(objects, pairs)
+
     # once more from the start: the new connection has another snapshot
     with suppress(ConnectionLostError):
-        return _Sweep(env, path, movers, request).swept(where, exclude, pairs)
-    return _Sweep(env, path, movers, request).swept(where, exclude, pairs)
+        return swept()
+    return swept()
+
+
+Shapes = Mapping[int, CollisionShape]
+"""Surfaces, world frame, by ids of objects."""
+
+
+def shapes_of(
+    store: Store, objects: Sequence[Object], known: Shapes | None = None
+) -> Iterator[tuple[Object, CollisionShape]]:
+    """Objects with their surfaces; all but known ones are read, as they are needed."""
+    found = known or {}
+    parts = parts_of(store, [obj for obj in objects if obj.id not in found])
+    for obj in objects:
+        if obj.id not in found:
+            _, part = next(parts)
+            cloud, chord, index = part.is_cloud, part.placed_chord, part.faces
+            yield obj, CollisionShape(part.surface(), is_cloud=cloud, chord=chord, index=index)
+        else:
+            yield obj, found[obj.id]
 
 
 class SweepRequest(NamedTuple):
-    """Arguments as for `sweep`; until : end, `time.monotonic`."""
+    """Arguments as for `sweep`; until : end, `time.monotonic`; known : surfaces in memory."""
 
     contact: float
     overlap: float
@@ -114,6 +138,7 @@ class SweepRequest(NamedTuple):
     progress: Progress | None
     limit: float = np.inf
     until: float = np.inf
+    known: Shapes | None = None
 
     def begun(self, limit: float | None, seconds: float | None) -> "SweepRequest":
         """Check numbers, and begin to count the seconds; UsageError."""
@@ -128,13 +153,6 @@ class SweepRequest(NamedTuple):
             raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
         until = np.inf if seconds is None else time.monotonic() + seconds
         return self._replace(limit=most, until=until)
-
-
-def shape_of(part: Part) -> CollisionShape:
-    """Surface of a part, world frame."""
-    return CollisionShape(
-        part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord, index=part.faces
-    )
 
 
 def center_of(tool: ToolSurface, about: ArrayLike | None) -> Floats:
@@ -206,7 +224,7 @@ class _Touched(NamedTuple):
     found: Contact
 
 
-class _Sweep:
+class PathSweep:
     """State of one sweep."""
 
     def __init__(
@@ -224,22 +242,20 @@ class _Sweep:
         self._undecided: list[Object] = []
         self._error = 0.0  # chord errors where the gap was measured
 
-    def swept(self, where: Words, exclude: Words, pairs: Sequence[LinkPair]) -> Swept:
-        """Sweep, in one snapshot."""
+    def swept(self, objects: list[Object], pairs: Sequence[LinkPair] = ()) -> Swept:
+        """Sweep among objects, in the present snapshot."""
         began, is_stopped = time.monotonic(), False
-        with self._env.store.snapshot():
-            revision = self._env.store.revision()
-            objects = self._env.select(where, exclude)
-            try:
-                # links first: their gaps bound the search among the objects, and read no database
-                for least, mover, obj, shape in pairs:
-                    has_hit = bool(self._hits or self._enclosed)
-                    if least < (self._wanted() if has_hit else self._best):
-                        self._measure_object(mover(), obj, shape, is_inside=True)
-                near = self._decide(objects)
-                self._follow()
-            except OverTimeError:
-                near, is_stopped = len(objects), True
+        revision = self._env.store.revision()
+        try:
+            # links first: their gaps bound the search among the objects, and read no database
+            for least, mover, obj, shape in pairs:
+                has_hit = bool(self._hits or self._enclosed)
+                if least < (self._wanted() if has_hit else self._best):
+                    self._measure_object(mover(), obj, shape, is_inside=True)
+            near = self._decide(objects)
+            self._follow()
+        except OverTimeError:
+            near, is_stopped = len(objects), True
         # objects are decided by distance of boxes, not in the order of the path
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
         hits = hits[:1] if self._request.until_hit else hits
@@ -267,14 +283,14 @@ class _Sweep:
         # best first: a small gap soon bounds all others; stable, so results repeat
         order = np.argsort(nearest, kind="stable").tolist()
         n_near = int((nearest < self._request.limit).sum())
-        parts = parts_of(self._env.store, [objects[i] for i in order])
+        ordered, known = [objects[i] for i in order], self._request.known
+        shapes = shapes_of(self._env.store, ordered, known)
         for n, i in enumerate(order):
             least = float(nearest[i])
             if least >= self._wanted():
                 self._closed = min(self._closed, least)
                 return n
-            obj, part = next(parts)
-            shape = shape_of(part)
+            obj, shape = next(shapes)
             for n_mover, mover in enumerate(self._movers):
                 least = float(least_gaps[n_mover, i])
                 if least >= self._wanted():

@@ -35,6 +35,7 @@ FIELDS = {
         "comes_out hits touching enclosed undecided contact overlap objects queries revision "
         "elapsed is_stopped length=path.length notes"
     ),
+    "TargetReach": "object verdict n_free n_angles free gap obstacles pose",
     "RemovalPath": "how poses length gap proof=swept",
 }
 """Fields of a result in JSON, by its class, in the form of `record`; other classes give all."""
@@ -56,7 +57,7 @@ COLUMNS = {
     "force": WRENCH[:3],
     "torque": WRENCH[3:],
     "place": _POSE[:3],
-    "touched": ("touched_ids", "touched_names"),
+    **{key: (f"{key}_ids", f"{key}_names") for key in ("touched", "obstacles")},
     "places": tuple(f"{of}_{name}" for of in "ab" for name in _POSE[:3]),
     "volume": ("volume_m3",),
     "hand_velocity": tuple(f"hand_{name}" for name in _SPEED),

@@ -63,7 +63,7 @@ def columns_of(keys: Iterable[str], records: Iterable[Mapping[str, Any]]) -> dic
 def _numbers(key: str, value: Any, count: int) -> Any:  # noqa: ANN401 - of JSON
     if value is None:
         return [None] * count
-    if key == "touched":
+    if key in {"touched", "obstacles"}:
         return [" ".join(str(o["id"]) for o in value), "; ".join(str(o["name"]) for o in value)]
     return value if count > 1 else [value]
 

@@ -70,6 +70,10 @@ class Reached(Tabular):
     revision: int
     elapsed: float
 
+    def __repr__(self) -> str:
+        n_reachable = sum(one.n_free > 0 for one in self.targets)
+        return f"Reached({n_reachable} of {len(self.targets)}, {self.elapsed:.2f} s)"
+
     def columns(self) -> Columns:
         """A row for each target."""
         return columns_of(REACH_KEYS, map(plain, self.targets))
@@ -220,8 +224,8 @@ class _Search:
         n_free, verdict = int(is_free.sum()), PathVerdict.NOT_REACHABLE
         if n_free or any(one.verdict is PathVerdict.NOT_DECIDED for one in found):
             verdict = PathVerdict.REACHABLE if n_free else PathVerdict.NOT_DECIDED
-        # rounded: ends that are equal are so on every machine
-        return (n_free, round(length, 6)), TargetReach(
+        # rounded beyond the tolerance of hits: equal ends stay equal
+        return (n_free, round(length, 3)), TargetReach(
             target, verdict, n_free, len(found), _runs(self._angles, is_free),
             max((one.gap.at_least for one in found if one.is_free), default=None),
             tuple(near[number] for number, _ in hits.most_common()), end @ self._poses[1],

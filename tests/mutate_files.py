@@ -33,9 +33,9 @@ from hapticdb.mesh import SUFFIXES, MeshFile, child, parse_in_process
 from hapticdb.mesh.parse import reader_of
 
 FORMATS = (*SUFFIXES, *OTHERS)
-SLOWEST = 30.0
-"""Seconds after which reading a file counts as a hang."""
-HUNG = f"killed by {signal.SIGALRM.value}"
+SLOWEST, LONGEST = 30.0, 120.0
+"""Seconds of processor time, and of a busy machine's clock, after which reading a file hangs."""
+HANGS = signal.SIGPROF, signal.SIGALRM
 BASE_BYTES = 64 << 20
 """Bytes that a file may take beyond ten times its size and the size of its result."""
 
@@ -92,7 +92,8 @@ def fault(path: Path) -> str:
     pid = os.fork()
     if pid == 0:
         try:
-            signal.setitimer(signal.ITIMER_REAL, SLOWEST)
+            signal.setitimer(signal.ITIMER_PROF, SLOWEST)
+            signal.setitimer(signal.ITIMER_REAL, LONGEST)
             for stream in (1, 2):  # libraries write there
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
             os.write(ends[1], json.dumps(_read(path)).encode()[:4000])
@@ -104,7 +105,7 @@ def fault(path: Path) -> str:
     _, status, usage = os.wait4(pid, 0)
     if os.WIFSIGNALED(status):
         # an import's child may crash, too, and its reader says so in one line
-        is_told = path.suffix in SUFFIXES and os.WTERMSIG(status) != signal.SIGALRM
+        is_told = path.suffix in SUFFIXES and os.WTERMSIG(status) not in HANGS
         return "" if is_told else f"killed by {status}"
     found, n_result = json.loads(said)
     peak = (usage.ru_maxrss << 10) - before
@@ -124,7 +125,9 @@ def run(suffix: str, numbers: Sequence[int], folder: Path) -> int:
         random = Random(n)  # noqa: S311 - damages, no secrets
         path.write_bytes(mutated(random, suffix, random.choice(known), random.choice(known)))
         found = fault(path)
-        if found == HUNG:  # a fork may inherit a lock of a library's thread; a real hang repeats
+        if found in {
+            f"killed by {one.value}" for one in HANGS
+        }:  # a fork may inherit a lock of a library's thread; a real hang repeats
             found = fault(path)
         if found:
             n_bad += 1
@@ -144,7 +147,7 @@ def main() -> int:
         numbers = range(n_format, given.files, len(FORMATS)) if given.only is None else [given.only]
         with tempfile.TemporaryDirectory(prefix="hapticdb-mutated-") as folder:
             return int(run(FORMATS[n_format], numbers, Path(folder)) > 0)
-    limit = 60 + SLOWEST * given.files  # for a run that hangs
+    limit = 60 + LONGEST * given.files  # for a run that hangs
     is_bad = False
     for n in range(len(FORMATS)):
         command = [sys.executable, __file__, str(given.files), f"--format={n}"]

@@ -281,3 +281,34 @@ def test_sweep_envelope_stores_that_of_a_machine(run: Run, scene: Path) -> None:
         low, high = env.find("crane")[0].bounds
     assert low == pytest.approx([-0.01, -0.01, 0.06], abs=2e-3)
     assert high == pytest.approx([0.01, 0.01, 0.1], abs=2e-3)
+
+
+@pytest.mark.usefixtures("free", "through")
+def test_sweep_gaps_are_written_as_a_table_and_a_plot(run: Run, scene: Path) -> None:
+    sweep = ("sweep", scene, *TOOL, "--path", "free.csv")
+    out = succeeded(run(*sweep, "--gaps", "gaps.csv", "--gaps", "gaps.svg", "--within", 45))
+    assert "3 pairs within 45 mm" in out
+    rows = [*csv.DictReader(scene.with_name("gaps.csv").read_text().splitlines())]
+    assert {row["name"] for row in rows} == {"box0", "box1", "box2"}
+    assert min(float(row["at_least_m"]) for row in rows) == pytest.approx(0.04, rel=0.01)
+    assert "box2: 39." in scene.with_name("gaps.svg").read_text()
+    refused(run(*sweep, "--gaps", "gaps.csv"), "--gaps")
+    refused(run(*sweep, "--gaps", "gaps.png"), "--gaps", ".svg")
+    refused(run(*sweep, "--within", 5), "--within", "--gaps")
+    refused(run("sweep", scene, "--batch", "many.csv", "--gaps", "a.csv"), "--gaps", "--batch")
+
+
+@pytest.mark.usefixtures("free")
+def test_sweep_cloud_radius_says_what_free_means(run: Run, scene: Path) -> None:
+    places = np.array([[0.0, 0.0, 0.2], [0.4, 0.0, 0.2]])
+    trimesh.PointCloud(places).export(scene.with_name("scan.ply"))
+    succeeded(run("import", "scan.db", "scan.ply", "--bits", 5, "--unit", "m"))
+    sweep = ("sweep", "scan.db", *TOOL, "--path", "free.csv")
+    name = json.loads(run("objects", "scan.db", "--json")[1])["name"]
+    found = json.loads(run(*sweep, "--json")[1])
+    assert f"{name}: no point within " in found["line"]
+    assert "nothing proved between points" in found["line"]
+    assert ([one["name"] for one in found["clouds"]], found["cloud_radius"]) == ([name], 0.0)
+    ball = json.loads(run(*sweep, "--json", "--cloud-radius", 10)[1])
+    assert ball["gap"] == pytest.approx(found["gap"] - 0.01, abs=1e-5)
+    assert f"the points of {name} are balls of radius 10 mm" in ball["line"]

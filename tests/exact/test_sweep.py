@@ -234,7 +234,7 @@ def test_time_ends_a_contact_that_is_followed(
     seconds = count()
     clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
     monkeypatch.setattr("hapticdb.exact.distance.time", clock)
-    monkeypatch.setattr("hapticdb.exact.sweep.time", clock)
+    monkeypatch.setattr("hapticdb.exact.movers.time", clock)
     path = line(SEATED, (0.05, 0.0, 0.5 * CUBE))
     with imported(tmp_path, {"plate": box_at((0.3, 0.3, 0.02), (0.0, 0.0, -0.01))}) as env:
         found = sweep(env, TOOL, path, contact=1e-6, seconds=20.0)

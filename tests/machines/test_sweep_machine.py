@@ -94,6 +94,35 @@ def test_an_excavators_gap_is_that_of_its_closed_form(env: Environment, tmp_path
     assert reach == pytest.approx(1.95 - gap, abs=0.01 * gap + 1e-4)
 
 
+def test_sweep_machine_gaps_bound_the_closed_form_of_objects_and_links(
+    env: Environment, tmp_path: Path
+) -> None:
+    joints = (*EXCAVATOR[3:], joint("fix", "base foot", "fixed", "1 0 0", "1 -0.5 0"))
+    links = (*EXCAVATOR[:3], link("foot", box("0.2 0.2 0.2")))
+    machine = machine_of(tmp_path, *links, *joints)
+    q = np.array([[1.5, 1.0], [1.5, 1.0], [-0.2, -1.1], [0.4, 0.9]])
+    found = sweep_machine(env, machine, q, where=["wall"], within=1.0)
+    assert found.gaps is not None
+    shares = np.linspace(0.0, 3.0, 200_001)
+    a, b = (np.interp(shares, np.arange(4), column) for column in q.T)
+    x, z = np.cos(a) + 0.7 * np.cos(a + b), np.sin(a) + 0.7 * np.sin(a + b)
+    beside = np.maximum(np.abs([x - 1.0, np.full_like(x, 0.5), z]) - 0.1, 0.0)
+    gaps = {
+        frozenset({"stick", "wall"}): 1.95 - x,
+        frozenset({"stick", "foot"}): np.linalg.norm(beside, axis=0) - 0.05,
+        frozenset({"foot", "wall"}): np.full_like(x, 0.9),
+    }
+    assert {frozenset({one.body, one.object.name}) for one in found.gaps.intervals} == gaps.keys()
+    for one in found.gaps.intervals:
+        least = gaps[frozenset({one.body, one.object.name})][
+            (one.begin <= shares) & (shares <= one.end)
+        ].min(initial=9.0)
+        # the ball is triangles around it, and the samples are apart
+        assert one.at_least <= least + 1e-5
+        assert least <= one.at_most + 1e-3
+        assert one.at_most - one.at_least <= max(1.1e-4, 0.011 * one.at_most)
+
+
 def test_a_gantry_is_clear_by_its_closed_form_and_hits_where_it_must(
     env: Environment, tmp_path: Path
 ) -> None:

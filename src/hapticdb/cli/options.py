@@ -153,6 +153,10 @@ sweep.envelope NAME: Store all that the motion sweeps as an object of this name.
 sweep.envelope_voxel LENGTH/mm [2 million in the path's box]: edge of its voxels.
 sweep.replace: Replace an envelope of this name.
 sweep.until_hit: End at the first hit on the path: faster.
+sweep.cloud_radius LENGTH/mm [0]: radius of the points of clouds; with 0, nothing is between them.
+sweep.gaps FILE: Write the gap of each near pair along the path to a new file: .csv, .parquet or
+  .npz, or .svg, a plot.
+sweep.within LENGTH/mm [50]: pairs so near are in --gaps.
 
 reach.axis X,Y,Z [the target's axis of symmetry, from both ends]: Outward direction of the axis.
 reach.approach [-z]: Direction in which the tool moves onto the target, tool's frame.

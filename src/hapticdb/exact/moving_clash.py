@@ -14,9 +14,10 @@ from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.exact.clash import classify_pair
 from hapticdb.exact.distance import Pair, box_gaps
+from hapticdb.exact.movers import shapes_of
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import CONTACT
-from hapticdb.exact.sweep import center_of, shapes_of
+from hapticdb.exact.sweep import center_of
 from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.tool_surface import ToolSurface

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
+from hapticdb.exact.movers import Mover, SweepRequest, shapes_of
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import CONTACT
-from hapticdb.exact.sweep import Mover, PathSweep, SweepRequest, center_of, shapes_of
+from hapticdb.exact.sweep import PathSweep, center_of
 from hapticdb.exact.swept import Swept
 from hapticdb.kernels.surfaces.triangle_bvh import normals_of
 from hapticdb.kernels.triangles.path_distance import MEETING

@@ -4,7 +4,7 @@ Broad phase: the objects' boxes, never too few of them. Narrow phase: their surf
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -15,15 +15,16 @@ from hapticdb.environment import Environment
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.exact.contact import Contact
 from hapticdb.exact.distance import Least, OverTimeError, Pair, box_gaps, error_of
+from hapticdb.exact.gap_curve import gap_curve
+from hapticdb.exact.movers import LinkPair, Mover, SweepRequest, shapes_of
 from hapticdb.exact.path import SampledPath, ToolPath
 from hapticdb.exact.separation import CONTACT, SAME, Separation
 from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
-from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.pointshell.tool_surface import ToolSurface
-from hapticdb.store.base import Object, Progress, Store
+from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 
 FIRST_SHARE, LATER = 1 / 64, 4.0
@@ -44,7 +45,7 @@ def sweep(
     contact: float = CONTACT, overlap: float = 0.0, seated: bool = False,
     about: ArrayLike | None = None,
     limit: float | None = None, seconds: float | None = None,
-    until_hit: bool = False,
+    until_hit: bool = False, cloud_radius: float = 0.0, within: float | None = None,
     progress: Progress | None = None,
 ) -> Swept:  # fmt: skip
     """Move a tool along a path: its hits with their places, or its least distance.
@@ -75,6 +76,9 @@ def sweep(
         Greatest distance that is told, metres; time after which the sweep ends undecided.
     until_hit : bool
         End at the first hit.
+    cloud_radius, within : float
+        Radius of the points of clouds, metres: with 0, nothing is between two of them; greatest
+        distance of the curve `gaps`, which is made if it is given.
     progress : callable or None
         Called with the number of objects decided, and of all near the path.
 
@@ -86,15 +90,16 @@ def sweep(
     ObjectNotFoundError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    request = SweepRequest(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
+    request = SweepRequest(contact, overlap, seated, until_hit, progress, cloud_radius, within)
+    request = request.begun(limit, seconds)
     tool = ToolSurface(shell)
     path = ToolPath.of(poses, tool.corners, center_of(tool, about)).checked()
     return swept_along(env, path, [Mover(tool, path)], request, where, exclude)
 
 
 def swept_along(
-    env: Environment, path: SampledPath, movers: Sequence["Mover"], request: "SweepRequest",
-    where: Words, exclude: Words, pairs: Sequence["LinkPair"] = (),
+    env: Environment, path: SampledPath, movers: Sequence[Mover], request: SweepRequest,
+    where: Words, exclude: Words, pairs: Sequence[LinkPair] = (),
 ) -> Swept:  # fmt: skip
     """Sweep rigid bodies, and pairs of them, along one path."""
 
@@ -109,52 +114,6 @@ def swept_along(
     return swept()
 
 
-Shapes = Mapping[int, CollisionShape]
-"""Surfaces, world frame, by ids of objects."""
-
-
-def shapes_of(
-    store: Store, objects: Sequence[Object], known: Shapes | None = None
-) -> Iterator[tuple[Object, CollisionShape]]:
-    """Objects with their surfaces; all but known ones are read, as they are needed."""
-    found = known or {}
-    parts = parts_of(store, [obj for obj in objects if obj.id not in found])
-    for obj in objects:
-        if obj.id not in found:
-            _, part = next(parts)
-            cloud, chord, index = part.is_cloud, part.placed_chord, part.faces
-            yield obj, CollisionShape(part.surface(), is_cloud=cloud, chord=chord, index=index)
-        else:
-            yield obj, found[obj.id]
-
-
-class SweepRequest(NamedTuple):
-    """Arguments as for `sweep`; until : end, `time.monotonic`; known : surfaces in memory."""
-
-    contact: float
-    overlap: float
-    seated: bool
-    until_hit: bool
-    progress: Progress | None
-    limit: float = np.inf
-    until: float = np.inf
-    known: Shapes | None = None
-
-    def begun(self, limit: float | None, seconds: float | None) -> "SweepRequest":
-        """Check numbers, and begin to count the seconds; UsageError."""
-        most = np.inf if limit is None else limit
-        if not 0.0 < self.contact < np.inf:
-            raise UsageError(f"contact {self.contact} m: give a length above 0")
-        if not most > 0.0:
-            raise UsageError(f"limit {limit} m: give a length above 0")
-        if not 0.0 <= self.overlap < np.inf:
-            raise UsageError(f"overlap {self.overlap} m: give 0 or a length above 0")
-        if seconds is not None and not seconds > 0.0:
-            raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
-        until = np.inf if seconds is None else time.monotonic() + seconds
-        return self._replace(limit=most, until=until)
-
-
 def center_of(tool: ToolSurface, about: ArrayLike | None) -> Floats:
     """Centre (3,) of turns: as given, or the middle of the tool's box."""
     if about is None:
@@ -163,54 +122,6 @@ def center_of(tool: ToolSurface, about: ArrayLike | None) -> Floats:
     if center.shape != (3,) or not np.isfinite(center).all():
         raise UsageError(f"a centre of turns {about}: give three lengths, metres")
     return center
-
-
-class Mover(NamedTuple):
-    """A rigid body on its own path.
-
-    body : name of a machine's link; parameters (N,) : parameters of the given path at the poses of
-    its own, if they differ; frame : `world_from_frame` at a parameter of the given path, for a path
-    in the frame of another link.
-    """
-
-    tool: ToolSurface
-    path: ToolPath
-    body: str = ""
-    parameters: Floats | None = None
-    frame: Callable[[float], Floats] | None = None
-
-    def own(self, given: float) -> float:
-        """Parameter of its own path, for one of the given path."""
-        return (
-            given
-            if self.parameters is None
-            else float(np.interp(given, self.parameters, self.path.parameters))
-        )
-
-    def given(self, own: float) -> float:
-        """First parameter of the given path, for one of its own."""
-        if self.parameters is None:
-            return own
-        n = int(np.searchsorted(self.path.parameters, own))
-        # at a pose exactly: a link at rest has many given parameters there, the first one counts
-        is_there = n < len(self.parameters) and self.path.parameters[n] == own
-        return float(
-            self.parameters[n]
-            if is_there
-            else np.interp(own, self.path.parameters, self.parameters)
-        )
-
-
-class LinkPair(NamedTuple):
-    """Two links of a machine: one in the frame of the other, which stands for an object.
-
-    least : lower bound of their gap on the path, metres.
-    """
-
-    least: float
-    mover: Callable[[], Mover]
-    object: Object
-    shape: CollisionShape
 
 
 class _Touched(NamedTuple):
@@ -240,6 +151,7 @@ class PathSweep:
         self._contacts: list[_Touched] = []
         self._enclosed: list[Object] = []
         self._undecided: list[Object] = []
+        self._clouds: list[Object] = []
         self._error = 0.0  # chord errors where the gap was measured
 
     def swept(self, objects: list[Object], pairs: Sequence[LinkPair] = ()) -> Swept:
@@ -256,6 +168,7 @@ class PathSweep:
             self._follow()
         except OverTimeError:
             near, is_stopped = len(objects), True
+        gaps = gap_curve(self._env.store, self._path, self._movers, objects, pairs, self._request)
         # objects are decided by distance of boxes, not in the order of the path
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
         hits = hits[:1] if self._request.until_hit else hits
@@ -271,7 +184,8 @@ class PathSweep:
             contact=self._request.contact, overlap=self._request.overlap, objects=near,
             queries=self._n_queries + sum(one.pair.queries for one in self._contacts),
             revision=revision, elapsed=time.monotonic() - began,
-            is_stopped=is_stopped,
+            is_stopped=is_stopped, clouds=tuple(self._clouds),
+            cloud_radius=self._request.cloud_radius, gaps=gaps,
         )  # fmt: skip
 
     def _decide(self, objects: list[Object]) -> int:
@@ -291,6 +205,8 @@ class PathSweep:
                 self._closed = min(self._closed, least)
                 return n
             obj, shape = next(shapes)
+            if shape.is_cloud:
+                self._clouds.append(obj)
             for n_mover, mover in enumerate(self._movers):
                 least = float(least_gaps[n_mover, i])
                 if least >= self._wanted():
@@ -303,7 +219,8 @@ class PathSweep:
 
     def _box_gaps(self, objects: list[Object]) -> tuple[Floats, NDArray[np.bool_]]:
         """Least distances (L, O) of each mover's box, and whether it meets them at the start."""
-        found = [box_gaps(one.tool, one.path, objects)[1] for one in self._movers]
+        radius = self._request.cloud_radius
+        found = [box_gaps(one.tool.grown(radius), one.path, objects)[1] for one in self._movers]
         return (
             np.array([gaps.min(axis=1, initial=np.inf) for gaps in found]),
             np.array([gaps[:, 0] <= 0.0 for gaps in found]),
@@ -314,7 +231,8 @@ class PathSweep:
         if self._end >= self._path.length:
             return True
         # the path ends at the first hit: boxes that meet later do not matter
-        edges, gaps = box_gaps(mover.tool, mover.path, [obj])
+        tool = mover.tool.grown(self._request.cloud_radius)
+        edges, gaps = box_gaps(tool, mover.path, [obj])
         return bool(gaps[0, edges[:-1] <= mover.own(self._end)].min() < self._wanted())
 
     @property
@@ -343,7 +261,8 @@ class PathSweep:
         tool, path = mover.tool, mover.path
         error = shape.chord + tool.chord
         pair = Pair(
-            shape.tree, tool, path, self._request.until, mover.own(self._end), error,
+            shape.tree, mover.against(shape, self._request.cloud_radius), path,
+            self._request.until, mover.own(self._end), error,
             None if mover.parameters is None else obj.bounds,
         )  # fmt: skip
         contact, pose = self._request.contact, path.at([0.0])[0]
@@ -443,6 +362,11 @@ class PathSweep:
             self._closed = min(self._closed, closed - pair.error)
         if least is None:
             return
+        if shape.is_cloud and least.at_most > MEETING:
+            # measured from the points to a tool grown by the radius of their balls
+            share = self._request.cloud_radius / least.at_most
+            back = share * (least.on_tool - least.on_object)
+            least = least._replace(on_tool=least.on_tool + back, on_object=least.on_object + back)
         # meshes meet within their chord errors: the true surfaces may pass one another
         if pair.error and least.at_most <= pair.error and not self._collides(pair, shape, least):
             self._undecided.append(obj)
@@ -457,6 +381,11 @@ class PathSweep:
     def _collides(self, pair: Pair, shape: CollisionShape, least: Least) -> bool:
         """Whether the true surfaces collide: an overlap beyond the chord errors soon after."""
         parameter = min(least.parameter + BEYOND * pair.error, pair.path.length)
+        if shape.is_cloud and pair.tool.radius > pair.error:
+            near = pair.tool.grown(-pair.error).nearest(
+                shape.tree, pair.path.at([parameter]), np.array([pair.error])
+            )
+            return bool(near.at_most[0] <= 0.0)
         found = Separation(shape, pair.tool, pair.check_time)
         return found.depth(pair.path.at([parameter])[0], pair.error)[0] > 0.0
 

@@ -55,7 +55,8 @@ def verdict_line(found: Swept, shell: PointShell | None) -> str:
             "not decided: the time was over before the surfaces of all objects near the path were "
             "measured; give more --seconds"
         )
-    return "; ".join([_free_clause(found) + overlaps_text(found), *_touching_clauses(found)])
+    clauses = [*_touching_clauses(found), *_cloud_clauses(found)]
+    return "; ".join([_free_clause(found) + overlaps_text(found), *clauses])
 
 
 def overlaps_text(found: Swept) -> str:
@@ -158,6 +159,16 @@ def _touching_clauses(found: Swept) -> Iterable[str]:
     resting = [one for one in found.touching if not one.is_sliding]
     if resting:
         yield f"touches {_touched_text(resting)}"
+
+
+def _cloud_clauses(found: Swept) -> Iterable[str]:
+    """Write the meaning of a free path among points."""
+    if found.clouds and found.cloud_radius:
+        radius = length_text(found.cloud_radius)
+        yield f"the points of {names_of(found.clouds)} are balls of radius {radius}"
+    elif found.clouds:
+        gap = length_text(found.gap.at_least)
+        yield f"{names_of(found.clouds)}: no point within {gap}, and nothing proved between points"
 
 
 def _touched_text(touched: Sequence[TouchedObject]) -> str:

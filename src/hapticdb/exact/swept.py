@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.exact.gap_curve import GapCurve
 from hapticdb.exact.path import SampledPath
 from hapticdb.store.base import Object
 from hapticdb.tabular.schema import plain
@@ -114,6 +115,12 @@ class Swept(Tabular):
         Whether the time ended the sweep before all was decided.
     notes : tuple of str
         Of a machine: limits exceeded, pairs of links left out.
+    clouds : tuple of Object
+        Point clouds near the path.
+    cloud_radius : float
+        Radius of their points, metres.
+    gaps : GapCurve or None
+        The gap along the path, if `within` was given.
     """
 
     path: SampledPath
@@ -130,6 +137,9 @@ class Swept(Tabular):
     elapsed: float
     is_stopped: bool = False
     notes: tuple[str, ...] = ()
+    clouds: tuple[Object, ...] = ()
+    cloud_radius: float = 0.0
+    gaps: GapCurve | None = None
 
     def __repr__(self) -> str:
         names = [obj.name for obj in (*(place.object for place in self.hits), *self.enclosed)]

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.exact.movers import Mover
 from hapticdb.exact.path import ToolPath, checked_poses
-from hapticdb.exact.sweep import Mover, center_of
+from hapticdb.exact.sweep import center_of
 from hapticdb.grid import corners_of
 from hapticdb.kernels.surfaces.triangle_bvh import normals_of
 from hapticdb.kernels.surfaces.voxelize import brick_voxels, voxelize_pieces

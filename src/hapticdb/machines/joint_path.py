@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import FileError, UsageError
+from hapticdb.exact.movers import Mover
 from hapticdb.exact.path import SampledPath, ToolPath
-from hapticdb.exact.sweep import Mover
 from hapticdb.machines.machine import HINGE, Bounds, Machine, motion_bounds
 from hapticdb.poses import as_floats
 from hapticdb.units import UNITS
@@ -174,4 +174,4 @@ def mover_of(
     poses[:, 3] = 0.0, 0.0, 0.0, 1.0
     motion = ToolPath.of(poses, surface.corners, surface.corners.mean(axis=0))
     parameters = np.interp(knots, np.arange(len(values)), path.parameters)
-    return Mover(surface, motion, machine.names[last], parameters, frame)
+    return Mover(surface, motion, machine.names[last], parameters, frame, DEVIATION)

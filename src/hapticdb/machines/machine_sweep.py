@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.exact.distance import OverTimeError
+from hapticdb.exact.movers import LinkPair, Mover, SweepRequest
 from hapticdb.exact.path import SampledPath, checked_poses
 from hapticdb.exact.separation import CONTACT
-from hapticdb.exact.sweep import LinkPair, Mover, SweepRequest, swept_along
+from hapticdb.exact.sweep import swept_along
 from hapticdb.exact.swept import Swept
 from hapticdb.machines.joint_path import (
     DEVIATION,
@@ -47,7 +48,7 @@ def sweep_machine(
     exclude: Words = (),
     contact: float = CONTACT, overlap: float = 0.0,
     limit: float | None = None, seconds: float | None = None,
-    until_hit: bool = False,
+    until_hit: bool = False, cloud_radius: float = 0.0, within: float | None = None,
     progress: Progress | None = None,
 ) -> Swept:  # fmt: skip
     """Move a machine along a joint path: its hits with objects and with itself, or the least gap.
@@ -62,7 +63,7 @@ def sweep_machine(
         Values of the joints `machine.driven`, rad or m; they move linearly between two rows.
     at : (4, 4) array or None
         `world_from_base`, metres; the world's frame unless given.
-    where, exclude, contact, overlap, limit, seconds, until_hit, progress
+    where, exclude, contact, overlap, limit, seconds, until_hit, cloud_radius, within, progress
         As for `sweep`. Where the path starts, the machine may touch as a part at its place.
 
     Returns
@@ -77,10 +78,11 @@ def sweep_machine(
     UsageError, FileError, ObjectNotFoundError
         As for `sweep` and `read_machine`; if `q` is not finite or has another shape.
     """
-    if not isinstance(machine, Machine):
-        machine = read_machine(machine)
-    request = SweepRequest(contact, overlap, seated=True, until_hit=until_hit, progress=progress)
-    request = request.begun(limit, seconds)
+    machine = machine if isinstance(machine, Machine) else read_machine(machine)
+    request = SweepRequest(
+        contact, overlap, seated=True, until_hit=until_hit, progress=progress,
+        cloud_radius=cloud_radius, within=within,
+    ).begun(limit, seconds)  # fmt: skip
     base = np.eye(4) if at is None else checked_poses(np.asarray(at)[None])[0]
     values = checked_values(machine, q)
     try:

@@ -1,9 +1,12 @@
 """The tool's surface, for proximity queries against other surfaces."""
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.grid import corners_of
 from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH
 from hapticdb.kernels.triangles.path_distance import Search
 from hapticdb.kernels.triangles.path_motion import PathMotion
@@ -35,6 +38,16 @@ class ToolSurface(CollisionShape):
         else:
             super().__init__(shell.surface.triangles, shell.surface, chord=shell.chord)
             self.corners = np.unique(shell.surface.triangles.reshape(-1, 3), axis=0)
+
+    def grown(self, radius: float) -> "ToolSurface":
+        """With balls about all its places, as far from points as it is from balls about them."""
+        if not radius:
+            return self
+        made = copy(self)
+        made.radius += radius
+        low, high = made.corners.min(axis=0), made.corners.max(axis=0)
+        made.corners = corners_of(np.stack([low - radius, high + radius]))
+        return made
 
     def nearest(
         self, other: TriangleBVH, poses: Floats, farthest: Floats, enough: float = 0.0

@@ -33,7 +33,7 @@ FIELDS = {
     "Swept": (
         "verdict gap=gap.at_least gap_at_most=gap.at_most chord_error=gap.error nearest=gap.place "
         "comes_out hits touching enclosed undecided contact overlap objects queries revision "
-        "elapsed is_stopped length=path.length notes"
+        "elapsed is_stopped length=path.length notes clouds cloud_radius"
     ),
     "TargetReach": "object verdict n_free n_angles free gap obstacles pose",
     "RemovalPath": "how poses length gap proof=swept",

@@ -139,18 +139,29 @@ def new_file(target: Path, option: str, *, replaces: bool = False) -> Iterator[P
 
 @contextmanager
 def open_table(
-    target: Path, option: str, *, replaces: bool = False
-) -> Iterator[Callable[[Columns], None]]:
-    """Open a file of a table by its suffix; yields the function for adding rows, piece by piece."""
-    if target.suffix not in SUFFIXES:
-        raise UsageError(f"{option} '{target}': give a name that ends with {', '.join(SUFFIXES)}")
+    target: Path, option: str, *, replaces: bool = False,
+    plot: Callable[[Columns], str] | None = None,
+) -> Iterator[Callable[[Columns], None]]:  # fmt: skip
+    """Open a file of a table by its suffix; yields the function for adding rows, piece by piece.
+
+    plot : draws all rows as SVG, for a name that ends with .svg.
+    """
+    suffixes = (*SUFFIXES, ".svg") if plot else SUFFIXES
+    if target.suffix not in suffixes:
+        raise UsageError(f"{option} '{target}': give a name that ends with {', '.join(suffixes)}")
     if target.suffix == ".parquet" and find_spec("pyarrow") is None:
         raise MissingExtraError(
             f"{option} '{target}' needs pyarrow: install it with {pip_line('parquet')}, or give a "
             "name that ends with .npz or .csv"
         )
     with new_file(target, option, replaces=replaces) as part:
-        if target.suffix == ".csv":
+        if plot and target.suffix == ".svg":
+
+            def draw(columns: Columns) -> None:
+                part.write_text(plot(columns), encoding="utf-8")
+
+            yield draw
+        elif target.suffix == ".csv":
             with part.open("w", encoding="utf-8", newline="") as file:
                 yield CsvWriter(file).write
         else:

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,6 +19,7 @@ from hapticdb.cli.tool_options import tool_of, warn_of_size
 from hapticdb.cli.values import Point, pose_of, refuse
 from hapticdb.errors import UsageError
 from hapticdb.tabular.schema import plain
+from hapticdb.tabular.tables import open_table
 from hapticdb.units import length_text
 from hapticdb.verdicts import SWEEP_VERDICTS, WORST, exit_codes
 
@@ -75,6 +78,9 @@ class SweepOptions:
     path_unit: UnitName | None = None
     seconds: float | None = None
     until_hit: bool = False
+    cloud_radius: float = 0.0
+    gaps: list[str] | None = None
+    within: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -141,17 +147,26 @@ def sweep(
     """See `HELP`."""
     import hapticdb
     from hapticdb.exact.swept import SWEPT_KEYS
+    from hapticdb.tabular.gap_plot import gap_plot
 
+    if not motion.gaps:
+        refuse("without --gaps", motion, "within")
     where, exclude = selection.where or [], selection.exclude or []
     one = ListedSweep(tool, part or [], path or "", where, exclude, contact, "")
     if machine != MachineOptions():
         one = _checked_machine(one, machine, motion, batch)
     else:
-        _check(one, motion.tool_unit, batch, output.csv)
+        _check(one, motion, batch, output.csv)
     if batch is not None or not stored.envelope:
         refuse("with --batch, or without a name for --envelope", stored)
     requests = [one] if batch is None else read_sweeps(batch, one)
-    with open_csv(output.csv, SWEPT_KEYS) as table, hapticdb.open(url, read_only=True) as env:
+    with (
+        open_csv(output.csv, SWEPT_KEYS) as table,
+        ExitStack() as curves,
+        hapticdb.open(url, read_only=True) as env,
+    ):
+        files = [Path(file) for file in motion.gaps or ()]
+        adds = [curves.enter_context(open_table(file, "--gaps", plot=gap_plot)) for file in files]
         exclude += stored.former(env)
         if machine.machine is None:
             jobs = [_job(env, each, motion.path_unit) for each in requests]
@@ -160,6 +175,9 @@ def sweep(
             findings = _all_told([_machine_swept(env, one, machine, motion)], output)
         if table:
             table.add(*findings[0].found.records())
+        if gaps := findings[0].found.gaps:
+            for add in adds:
+                add(gaps.columns())
         if batch is None and output.has_words:
             _show(findings[0])
         elif output.has_words:
@@ -173,9 +191,10 @@ def sweep(
 sweep.__doc__ = HELP
 
 
-def _check(one: ListedSweep, tool_unit: str | None, batch: str | None, csv: str | None) -> None:
+def _check(one: ListedSweep, motion: SweepOptions, batch: str | None, csv: str | None) -> None:
     """UsageError for contradictory options."""
     if batch is not None:
+        refuse("with --batch", motion, "gaps")
         given = {"--tool": one.tool, "--part": one.part, "--path": one.path, "--csv": csv}
         for name, value in given.items():
             if value:
@@ -185,7 +204,7 @@ def _check(one: ListedSweep, tool_unit: str | None, batch: str | None, csv: str 
         raise UsageError("give one of --tool and --part")
     if not one.path:
         raise UsageError("give --path, a file of poses, or --batch")
-    if one.part and tool_unit is not None:
+    if one.part and motion.tool_unit is not None:
         raise UsageError("--tool-unit has no meaning with --part: leave it out")
 
 
@@ -264,6 +283,7 @@ def _machine_swept(
             env, machine, q, at=None if given.at is None else pose_of(given.at, "--at"),
             where=selection.where, exclude=selection.exclude, contact=request.contact,
             overlap=motion.overlap, seconds=motion.seconds, until_hit=motion.until_hit,
+            cloud_radius=motion.cloud_radius, within=motion.within if motion.gaps else None,
             progress=progress,
         )  # fmt: skip
     for note in found.notes:
@@ -292,6 +312,7 @@ def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Findings:
                 env, shell, job.poses, where=selection.where, exclude=selection.exclude,
                 contact=request.contact, overlap=motion.overlap, seated=request.tool is None,
                 about=motion.about, seconds=motion.seconds, until_hit=motion.until_hit,
+                cloud_radius=motion.cloud_radius, within=motion.within if motion.gaps else None,
                 progress=progress,
             )  # fmt: skip
     if env.store.revision() != found.revision:
@@ -342,4 +363,8 @@ def _show(findings: _Findings) -> None:
     )
     searched = f"{near} near the path, {checks}"
     facts += [("looked at", searched), ("took", f"{findings.seconds:.2f} s")]
+    if gaps := found.gaps:
+        late = ", the time was over: some are missing" * gaps.is_stopped
+        pairs = render.counted(gaps.pairs, "pair")
+        facts.append(("curve", f"{pairs} within {length_text(gaps.within)}{late}"))
     render.facts(facts)

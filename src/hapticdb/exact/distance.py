@@ -1,18 +1,21 @@
 """Distances of the tool and one object along a path, and their first collision."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.exact.path import ToolPath
+from hapticdb.exact.profile import gap_on_screw, screw_of
 from hapticdb.exact.separation import MovedPair
 from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH
 from hapticdb.kernels.triangles.path_distance import MEETING, Search
 from hapticdb.kernels.triangles.path_motion import PathMotion
 from hapticdb.kernels.triangles.surface_distance import Nearest
+from hapticdb.pointshell.shape import bvh_of
 from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.store.base import Object
 
@@ -28,6 +31,8 @@ STRETCHES = 256
 FEW, SAMPLES, PARTS = 64, 128, 2048
 """Poses of a path that is searched whole; samples of a longer one, and its parts, of which those
 far from the object are left out. More: a shorter search, and more time before it."""
+TURNED, ENOUGH = 16, 0.009
+"""Samples of a screw motion, and relative tolerance of a least distance on it."""
 STEPS = 1 << 16
 """Entries of a search between two readings of the clock: some hundredths of a second. Larger: a
 time limit is overrun by more."""
@@ -50,7 +55,7 @@ class Pair:
     """The tool and one object along a path.
 
     tree : triangles of the object, world frame; until : end, `time.monotonic`, by OverTimeError;
-    end : last path parameter, the whole path unless given; error : chord errors of both, metres;
+    end : last path parameter, by default of the whole path; error : chord errors of both, metres;
     bounds (2, 3) : the object's box, if the search is to leave out what is far from it.
     """
 
@@ -89,28 +94,83 @@ class Pair:
         Returns the proved bound, too. In a collision it is the first one. After few proximity
         queries, the tolerance is nine times finer.
         """
-        # coarse first: its result bounds the finer search, and its queries tell the cost
+        found, closed = self._turned(begin, best) or self._straight(begin, best)
+        if found is None:
+            return None, closed
+        return found, 0.0 if found.at_most <= MEETING else max(min(closed, found.at_most), 0.0)
+
+    def _straight(self, begin: float, best: float) -> tuple[Least | None, float]:
+        # coarse first: its result bounds the finer search, and its queries show the cost
         found, closed, queries = self._search(begin, best, COARSE)
         known = best if found is None else found.at_most
         if MEETING < known < np.inf and queries <= EASY:
             nearer, closed, _ = self._search(begin, known, FINE)
             found = nearer or found
-        if found is None:
-            return None, closed
-        return found, 0.0 if found.at_most <= MEETING else max(min(closed, found.at_most), 0.0)
+        return found, closed
 
-    def _search(self, begin: float, best: float, fine: float) -> tuple[Least | None, float, int]:
-        """The same to `fine` metres, and the number of proximity queries."""
+    def _turned(self, begin: float, best: float) -> tuple[Least | None, float] | None:
+        """The same by the profiles of both surfaces on a screw motion; None without a proof.
+
+        The rest of path and surfaces is searched. All of it is, for half of the time, if the bounds
+        are far apart.
+        """
+        motion, tree, tool = self.path.motion, self.tree, self.tool.tree
+        reach = float(np.linalg.norm(self.tool.corners - motion.center, axis=1).max())
+        screw = None if self._bounds is not None or self.tool.radius else screw_of(motion, reach)
+        if screw is None:
+            return None
+        low, high = motion.parameters[[screw.first, screw.last]].clip(begin, self.length)
+        start = self._nearest_of(np.linspace(low, high, TURNED), best)
+        far = best if start is None else start.at_most
+        if not MEETING < far < np.inf:
+            return None
+        pose = self.path.at(motion.parameters[screw.first : screw.first + 1])[0]
+        placed = tool.corners @ pose[:3, :3].T + pose[:3, 3]
+        bound, is_within, rest = gap_on_screw(tree.corners, placed, screw, far)
+        if bound <= MEETING:
+            return None
+        parts = [(tree, tool, 0, screw.first), (tree, tool, screw.last, len(motion.turns))]
+        if rest.any():
+            left = bvh_of((tool if is_within else tree).corners[rest])
+            sides = (tree, left) if is_within else (left, tool)
+            parts.insert(1, (*sides, screw.first, screw.last))
+        pieces = [(a, b, part_of(motion, n, m + 1)) for a, b, n, m in parts if n < m]
+        found, closed, _ = self._search(begin, best, FINE, start, pieces)
+        closed = min(closed, bound)
+        known = MEETING if found is None else found.at_most
+        if found is not None and known > MEETING and known - closed > max(ENOUGH * known, FINE):
+            until, now = self.until, time.monotonic()
+            self.until = now + 0.5 * (until - now)
+            # without the time for a finer proof the coarse one remains
+            with suppress(OverTimeError):
+                found, finer, _ = self._search(begin, known, ENOUGH * known, found)
+                closed = max(closed, finer)
+            self.until = until
+        return found, closed
+
+    def _search(
+        self, begin: float, best: float, fine: float, least: Least | None = None,
+        pieces: Iterable[tuple[TriangleBVH, TriangleBVH, PathMotion]] | None = None,
+    ) -> tuple[Least | None, float, int]:  # fmt: skip
+        """The same to `fine` metres, and the number of proximity queries.
+
+        least : initial upper bound; pieces : surfaces and their parts of the path, by default all.
+        """
         # upper bound from samples: branch and bound prunes from its first entry
-        least, closed, queries = self._sampled(begin, best), best, 0
-        for motion in self._motions(best if least is None else least.at_most):
+        least, closed, queries = least or self._sampled(begin, best), best, 0
+        if pieces is None:
+            motions = self._motions(best if least is None else least.at_most)
+            pieces = ((self.tree, self.tool.tree, motion) for motion in motions)
+        for tree, tool, motion in pieces:
             known, end = best if least is None else least.at_most, self.length
             if least is not None and known <= MEETING:
                 # a collision is known: only an earlier one matters
                 end = min(end, least.parameter)
                 if motion.parameters[0] >= end:
                     break
-            search = self.tool.search(self.tree, motion, begin=begin, best=known, fine=fine)
+            search = Search(
+                tree, tool, motion, radius=self.tool.radius, begin=begin, best=known, fine=fine
+            )
             self._finish(search, end)
             queries += search.queries
             (at_most, bound), (parameter,), (on_object, on_tool) = search.found
@@ -129,7 +189,9 @@ class Pair:
         """The nearest of some samples, if nearer than `best`: a long search begins with it."""
         if self._bounds is None or len(self.path.parameters) <= FEW:
             return None
-        parameters = np.linspace(begin, self.length, SAMPLES)
+        return self._nearest_of(np.linspace(begin, self.length, SAMPLES), best)
+
+    def _nearest_of(self, parameters: Floats, best: float) -> Least | None:
         near = self.measure(parameters, np.full(len(parameters), best))
         n = int(np.argmin(near.at_most))
         if near.pairs[n, 0] < 0:
@@ -153,10 +215,7 @@ class Pair:
             # whole segments of the path: outward on both sides
             low = int(self.path.segments(edges[first : first + 1])[0])
             high = int(np.searchsorted(parameters, edges[last])) + 1
-            yield motion._replace(
-                parameters=parameters[low:high], centers=motion.centers[low:high],
-                rotations=motion.rotations[low:high], turns=motion.turns[low : high - 1],
-            )  # fmt: skip
+            yield part_of(motion, low, high)
 
     def _finish(self, search: Search, end: float) -> None:
         """Search to an end; on a part of the path, as if they collided there."""
@@ -176,6 +235,14 @@ class Pair:
         """End the sweep by OverTimeError if its time is over."""
         if time.monotonic() > self.until:
             raise OverTimeError
+
+
+def part_of(motion: PathMotion, low: int, high: int) -> PathMotion:
+    """Motion through poses low .. high - 1."""
+    return motion._replace(
+        parameters=motion.parameters[low:high], centers=motion.centers[low:high],
+        rotations=motion.rotations[low:high], turns=motion.turns[low : high - 1],
+    )  # fmt: skip
 
 
 def box_gaps(tool: ToolSurface, path: ToolPath, objects: Sequence[Object]) -> tuple[Floats, Floats]:

@@ -151,16 +151,18 @@ def test_a_thin_arm_meets_a_post_far_beyond_half_a_turn(
     assert found.hits[0].fraction == pytest.approx(met / np.radians(degrees), abs=1e-4)
 
 
+@pytest.mark.parametrize("end", [0.0, 0.635])
 def test_sweep_machine_places_a_hit_before_all_samples_in_the_wall(
-    env: Environment, tmp_path: Path
+    env: Environment, tmp_path: Path, end: float
 ) -> None:
+    """The arm ends deep in the wall, or the last sample is the only one in it."""
     base = np.eye(4)
     base[0, 3] = 1.2
     found = sweep_machine(
-        env, machine_of(tmp_path, *ARM), [[np.pi], [0.0]], at=base, where=["wall"]
+        env, machine_of(tmp_path, *ARM), [[np.pi], [end]], at=base, where=["wall"]
     )
     met = 1e-3 + np.arccos(0.8 / np.hypot(1.0, 1e-3))  # a corner at (1, -1 mm) of the arm
-    assert found.hits[0].fraction == pytest.approx(1.0 - met / np.pi, abs=1e-5)
+    assert found.hits[0].fraction == pytest.approx((np.pi - met) / (np.pi - end), abs=1e-5)
 
 
 def test_a_gripper_closes_on_itself_by_a_joint_that_follows(

@@ -164,8 +164,8 @@ class Pair:
         for tree, tool, motion in pieces:
             known, end = best if least is None else least.at_most, self.length
             if least is not None and known <= MEETING:
-                # a collision is known: only an earlier one matters
-                end = min(end, least.parameter)
+                # a collision is known: only an earlier one matters, also before the path's end
+                end = min(float(np.nextafter(end, 0.0)), least.parameter)
                 if motion.parameters[0] >= end:
                     break
             search = Search(

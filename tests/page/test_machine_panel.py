@@ -1,4 +1,4 @@
-"""Tab Machine: base, joint path and sweep of a machine."""
+"""Machine in the tab Sweep: base, joint path and sweep of a machine."""
 
 from pathlib import Path
 

@@ -32,10 +32,10 @@ class TabbedBrowser(Browser):
         with tabs.add_tab("Parts"):
             self.parts = PartsPanel(self, gui)
         with tabs.add_tab("Sweep"):
+            if site.machine is not None:  # no tab: six have no room for their names
+                with gui.add_folder("Machine"):
+                    MachinePanel(self, gui, *site.machine)
             SweepPanel(self, gui)
-        if site.machine is not None:
-            with tabs.add_tab("Machine"):
-                MachinePanel(self, gui, *site.machine)
         with tabs.add_tab("Clashes"):
             self.clashes = ClashPanel(self, gui)
         with tabs.add_tab("Record"):

@@ -1,4 +1,4 @@
-"""Tab Machine: its base on a gizmo, its joint path, and the sweep along it."""
+"""Tab Sweep, a machine: its base on a gizmo, its joint path, and the sweep along it."""
 
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -44,7 +44,7 @@ class MachinePanel:
         self._values = checked_values(machine, q)
         self._marks: list[Any] = []
         guard, site, scene = browser.guarded, browser.site, browser.client.scene
-        assert site.request.machine is not None  # noqa: S101 - else there is no tab
+        assert site.request.machine is not None  # noqa: S101 - else there is no panel
         start = row_of_pose(site.request.machine.at)
         gui.add_html(note_html("Drag the base. The sweep proves the path between its rows, too."))
         self._at = gui.add_text(

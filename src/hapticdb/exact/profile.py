@@ -5,6 +5,7 @@ r >= rho the gradients of r and of psi / sqrt(1 + (h / rho)^2) are at right angl
 the distance of two surfaces in these coordinates bounds their distance from below, at any angle.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +24,9 @@ FINE, ROUNDS = 1e-7, 12
 """Error of a triangle's profile, metres, and bisections for it, at most."""
 EVEN, LEAST_PITCH, WIDEST = 1e-8, 1e-5, 0.5
 """Greatest error of a screw motion and its least pitch, metres; half the angle of a triangle."""
-IN_WAY = 0.5
-"""Radial clearance below which a triangle is excluded, as a share of the greatest distance."""
+IN_WAY, MOST_IN_WAY = 0.5, 0.1
+"""Radial clearance below which a triangle is excluded, as a share of the greatest distance; share
+of triangles that may be."""
 
 
 class Screw(NamedTuple):
@@ -79,17 +81,30 @@ def gap_on_screw(
         r, phi, z = _polar(corners, screw)
         sides.append((corners, r, _least_radius(r, phi), z))
     is_within = bool(sides[1][2].min() < sides[0][2].min())
-    (inner, r, _, z), (outer, _, least, heights) = sides[::-1] if is_within else sides
-    rise = -rise if is_within else rise
+    # a part may have the crests of a bolt alone: neither radius shows the inner surface for certain
+    for swapped in (is_within, not is_within):
+        inner, outer = sides[::-1] if swapped else sides
+        gap, rest = _gap_within(inner, outer, screw, -rise if swapped else rise, far)
+        if gap > 0.0 and rest.mean() < MOST_IN_WAY:
+            return gap, swapped, rest
+    return 0.0, is_within, np.zeros(len(thing if not is_within else tool), dtype=np.bool_)
+
+
+def _gap_within(
+    inner: Sequence[Floats], outer: Sequence[Floats], screw: Screw, rise: float, far: float
+) -> tuple[float, Flags]:
+    """The same for known sides: triangles, radii, least radii and heights of each."""
+    triangles, r, _, z = inner
+    around, _, least, heights = outer
     low, high = heights.min() + min(rise, 0.0) - far, heights.max() + max(rise, 0.0) + far
     # all others are farther than `far`, along the axis or across it
     is_met = (z.max(axis=1) > low) & (z.min(axis=1) < high) & (r.max(axis=1) > least.min() - far)
     is_outer = least < r[is_met].max(initial=0.0) + far
-    gap, rest = far, np.zeros(len(inner), dtype=np.bool_)
+    gap, rest = far, np.zeros(len(triangles), dtype=np.bool_)
     if is_met.any() and is_outer.any():
-        gap, left = _profile_gap(inner[is_met], outer[is_outer], screw, far)
+        gap, left = _profile_gap(triangles[is_met], around[is_outer], screw, far)
         rest[np.flatnonzero(is_met)[left]] = True
-    return gap, is_within, rest
+    return gap, rest
 
 
 def _profile_gap(

@@ -196,8 +196,14 @@ def test_files_are_refused_before_the_search_and_leave_nothing(
     nowhere = ("--junit", tmp_path / "a.xml", "--bcf", tmp_path / "none" / "a.bcfzip")
     refused(run("clashes", meeting, *nowhere), "--bcf: cannot write", "No such file")
     assert "2 new" in run("clashes", meeting)[1]
-    refused(run("clashes", meeting, "--junit", "one.xml", "--bcf", "one.xml"), "File exists")
-    refused(run("clashes", meeting, "--csv", "one.xml", "--junit", "one.xml"), "File exists")
+    refused(
+        run("clashes", meeting, "--junit", "one.xml", "--bcf", "one.xml"),
+        "another option names this file",
+    )
+    refused(
+        run("clashes", meeting, "--csv", "one.xml", "--junit", "one.xml"),
+        "another option names this file",
+    )
     refused(run("clashes", tmp_path / "no.db", "--junit", "one.xml"), "no environment")
     assert not [*tmp_path.rglob("*.xml"), *tmp_path.rglob("*.part")]
 

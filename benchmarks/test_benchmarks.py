@@ -45,9 +45,7 @@ def database(sample: SampleFiles) -> Path:
     return path
 
 
-def test_the_evaluation_has_every_experiment_on_every_engine_and_layout(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evaluate_all_experiments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     newest = max(find_binaries(), key=lambda found: found.major)
     monkeypatch.setattr(figures, "find_binaries", lambda: [newest])
     results = figures.evaluate(tmp_path, 7, TINY, many.Effort(0.2, (1, 2)), real=False)
@@ -65,7 +63,7 @@ def test_the_evaluation_has_every_experiment_on_every_engine_and_layout(
     assert len(list(tmp_path.glob("*.svg"))) == 5
 
 
-def test_cells_and_the_dense_bitmap_feel_the_same(database: Path, sample: SampleFiles) -> None:
+def test_measure_frames_cells_equal_dense_bitmap(database: Path, sample: SampleFiles) -> None:
     """`measure_frames` compares every bit itself."""
     shell, poses = PointShell.from_file(sample.spanner, 3000), read_poses(sample.path)
     found = in_real_time.measure_frames(database, shell, poses)
@@ -73,12 +71,12 @@ def test_cells_and_the_dense_bitmap_feel_the_same(database: Path, sample: Sample
     assert set(found["ratio"]) == {"flat", "session", "distance"}
 
 
-def test_edits_are_felt_and_taken_back(database: Path, sample: SampleFiles) -> None:
+def test_edits_change_hits_and_revert(database: Path, sample: SampleFiles) -> None:
     found = editing.edits(str(database), Path(sample.spanner), Path(sample.path), n_edits=2)
     assert (found["edits"], found["voxels"] > 0) == (2, True)
 
 
-def test_peers_agree_far_from_all_parts(tmp_path: Path) -> None:
+def test_measure_batch_peers_agree_far_from_parts(tmp_path: Path) -> None:
     settings = batches.Settings(0.01, most_poses=40, points=(300,))
     found = batches.measure(tmp_path, None, 7, settings)
     missing = {note.partition(":")[0] for note in found["notes"]}
@@ -89,7 +87,7 @@ def test_peers_agree_far_from_all_parts(tmp_path: Path) -> None:
             assert len(cell["sides"]) == 9 - len(missing)
 
 
-def test_the_spark_plug_comes_out_and_its_triangles_keep_the_proved_distance(
+def test_removal_paths_spark_plug_keeps_proved_gap(
     tmp_path: Path,
 ) -> None:
     if "CI" not in os.environ:
@@ -104,7 +102,7 @@ def test_the_spark_plug_comes_out_and_its_triangles_keep_the_proved_distance(
     assert 0.0 < row["gap_m"] <= row["mesh_distance_m"]
 
 
-def test_a_peg_comes_out_of_its_hole_by_its_nominal_gap(tmp_path: Path) -> None:
+def test_fits_peg_gap_is_nominal(tmp_path: Path) -> None:
     data = Path(os.environ["HAPTICDB_TEST_DATA"], "fits")
     row = fits.measured(tmp_path, data, "round 8 mm, tight", 6)
     assert row["verdict"] == "clear"
@@ -112,7 +110,7 @@ def test_a_peg_comes_out_of_its_hole_by_its_nominal_gap(tmp_path: Path) -> None:
     assert page_tables.tables()["fits"]({"fits": {"rows": [row]}}).count("\n") == 2
 
 
-def test_the_feel_has_every_measure_and_curve(tmp_path: Path, sample: SampleFiles) -> None:
+def test_measure_feeling_all_cells_and_curves(tmp_path: Path, sample: SampleFiles) -> None:
     effort = feeling.Effort(0, 1, (1000.0,), (0.0,), 100, 40, 7)
     (tmp_path / "scenes").mkdir()
     cells, curves = feeling.measure(effort, tmp_path / "scenes", Path(sample.car))
@@ -123,7 +121,7 @@ def test_the_feel_has_every_measure_and_curve(tmp_path: Path, sample: SampleFile
     assert {(c["curve"], c["law"]) for c in curves} == {one[:2] for one in feeling.PANELS}
 
 
-def test_every_warm_verb_is_timed(tmp_path: Path) -> None:
+def test_measure_warm_all_verbs(tmp_path: Path) -> None:
     cells = warm.measure(tmp_path, {"this": records.ROOT}, 1)
     assert [cell["verb"] for cell in cells] == [*warm.VERBS]
     assert all(cell["cpu_s"] > 0.0 for cell in cells)

@@ -73,7 +73,7 @@ def close_pairs(file: Path, rng: np.random.Generator) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_close_triangles_of_assemblies_are_never_told_too_far(name: str) -> None:
+def test_distances_lower_bound_below_coal(name: str) -> None:
     mine, others = close_pairs(
         Path(os.environ["HAPTICDB_TEST_DATA"], name), np.random.default_rng(4)
     )
@@ -121,7 +121,7 @@ def clamp(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_sweeps_of_open_shapes_are_told_as_they_are(tmp_path: Path, seed: int) -> None:
+def test_sweep_open_shapes_against_coal(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     scene, objects = trimesh.Scene(), []
     for n in range(6):
@@ -166,7 +166,7 @@ WITHIN = 1e-3
 
 
 @pytest.mark.parametrize("name", ASSEMBLIES)
-def test_every_pair_of_an_assembly_is_told_and_no_other(tmp_path: Path, name: str) -> None:
+def test_find_clashes_all_pairs_against_coal(tmp_path: Path, name: str) -> None:
     """All pairs of near boxes: none is lost, none invented, distances are the same to 1e-6 mm."""
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=5), distances=False)
     file = Path(os.environ["HAPTICDB_TEST_DATA"], name)

@@ -64,7 +64,7 @@ def pairs_of(path: Path) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("kind", ["threads", pytest.param("scheduler", marks=pytest.mark.long)])
-def test_imports_and_clashes_by_two_workers_are_those_of_one_process(
+def test_cluster_import_and_clashes_equal_one_process(
     kind: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scheduler: str = request.getfixturevalue(kind)
@@ -85,7 +85,7 @@ def test_imports_and_clashes_by_two_workers_are_those_of_one_process(
 
 
 @pytest.mark.long
-def test_touches_by_workers_are_those_of_one_process(
+def test_cluster_touch_equals_one_process(
     scheduler: str, scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(batch_tool, "TASK", 7)
@@ -101,7 +101,7 @@ def test_touches_by_workers_are_those_of_one_process(
 
 
 @pytest.mark.long
-def test_an_order_by_workers_is_that_of_one_process(scheduler: str, tmp_path: Path) -> None:
+def test_cluster_disassemble_equals_one_process(scheduler: str, tmp_path: Path) -> None:
     with hapticdb.open(made_of(tmp_path, STACK), read_only=True) as env:
         asked: dict[str, Any] = {"motions": 0, "keep": ["pot"]}
         here = disassemble(env, "content", **asked)
@@ -121,9 +121,7 @@ def test_an_order_by_workers_is_that_of_one_process(scheduler: str, tmp_path: Pa
 
 
 @pytest.mark.long
-def test_a_lost_worker_costs_no_row_and_no_pair(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cluster_lost_worker_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clashing, "PIECE", 1)
     file, here, there = balls(tmp_path, 24), tmp_path / "here.db", tmp_path / "there.db"
     hapticdb.import_files(here, [file], small_options())
@@ -146,7 +144,7 @@ def test_a_lost_worker_costs_no_row_and_no_pair(
 
 
 @pytest.mark.long
-def test_workers_read_a_server(
+def test_cluster_workers_read_server(
     scheduler: str, place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(clashing, "PIECE", 1)
@@ -158,9 +156,7 @@ def test_workers_read_a_server(
 
 
 @pytest.mark.long
-def test_ctrl_c_leaves_a_state_that_the_same_command_goes_on_from(
-    scheduler: str, tmp_path: Path
-) -> None:
+def test_cluster_resumes_after_ctrl_c(scheduler: str, tmp_path: Path) -> None:
     file, here, there = balls(tmp_path, 40), tmp_path / "here.db", tmp_path / "there.db"
     hapticdb.import_files(here, [file], small_options())
     grid = ("--bits", 5, "--voxel-size", 0.01, "--origin=-0.16,-0.16,-0.16")
@@ -182,7 +178,7 @@ def test_ctrl_c_leaves_a_state_that_the_same_command_goes_on_from(
     assert rows_of(there) == rows_of(here)
 
 
-def test_a_scheduler_that_is_not_there_is_told_in_a_line(
+def test_cluster_missing_scheduler(
     run: Run, scene: Path, made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "LONGEST_S", 0.5)
@@ -203,7 +199,7 @@ def test_a_scheduler_that_is_not_there_is_told_in_a_line(
     refused(run("clashes", scene, "--on", "tcp://127.0.0.1:1"), "install it with")
 
 
-def test_workers_that_cannot_do_it_are_told(
+def test_cluster_incompatible_workers(
     threads: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with hapticdb.open(scene) as env:
@@ -219,7 +215,7 @@ def test_workers_that_cannot_do_it_are_told(
 
 
 @pytest.mark.long
-def test_a_scheduler_without_a_worker_is_told(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cluster_no_worker(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "LONGEST_S", 3.0)
     with (
         scheduling(0) as address,
@@ -231,7 +227,7 @@ def test_a_scheduler_without_a_worker_is_told(scene: Path, monkeypatch: pytest.M
 
 @pytest.mark.long
 @pytest.mark.parametrize("is_stopped", [False, True])
-def test_a_scheduler_that_goes_away_or_stands_still_is_told(
+def test_cluster_scheduler_lost_or_hanging(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_stopped: bool
 ) -> None:
     monkeypatch.setattr(cluster, "LONGEST_S", 2.0)

@@ -33,7 +33,7 @@ def write(env: Environment, ijk: NDArray[np.int64], name: str, **fields: object)
 
 @pytest.mark.parametrize("rows_at_once", [1, 1 << 14])
 @pytest.mark.parametrize(("kind", "other"), PAIRS, ids=str)
-def test_rows_are_equal_where_python_sets_of_voxels_are(
+def test_diff_rows_equal_voxel_sets(
     monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, rows_at_once: int
 ) -> None:
     """On every layout and curve, in one batch and in many; another object shares voxels."""
@@ -65,7 +65,7 @@ def test_rows_are_equal_where_python_sets_of_voxels_are(
 
 
 @pytest.mark.parametrize("kind", [("brick", "z"), ("voxel", "hilbert")], ids=str)
-def test_parts_are_told_apart_by_what_differs(tmp_path: Path, kind: Kind) -> None:
+def test_diff_kinds_of_difference(tmp_path: Path, kind: Kind) -> None:
     ijk = blob(1, PLACE)
     changed: dict[str, dict[str, object]] = {
         "surfaces": {"digest": "other"},
@@ -94,7 +94,7 @@ def test_parts_are_told_apart_by_what_differs(tmp_path: Path, kind: Kind) -> Non
 
 
 @pytest.mark.parametrize("kept", ["other", "gone"])
-def test_an_altered_surface_is_found_under_its_old_digest(tmp_path: Path, kept: str) -> None:
+def test_diff_altered_surface_same_digest(tmp_path: Path, kept: str) -> None:
     vertices, faces = box((0, 0, 0), (0.05, 0.05, 0.05))
     part = Part("box", vertices, faces, np.eye(4))
     other = pack(2.0 * vertices, faces) if kept == "other" else None
@@ -107,7 +107,7 @@ def test_an_altered_surface_is_found_under_its_old_digest(tmp_path: Path, kept: 
     assert not found.is_equal
 
 
-def test_ids_alone_make_no_difference(tmp_path: Path) -> None:
+def test_diff_ids_alone_equal(tmp_path: Path) -> None:
     for n, name in enumerate(("a", "b"), start=1):
         with make(tmp_path / f"{name}.db") as env:
             write(env, blob(1, PLACE), "part", id=n)
@@ -116,7 +116,7 @@ def test_ids_alone_make_no_difference(tmp_path: Path) -> None:
     assert len(found.renumbered) == 1
 
 
-def test_how_far_a_part_has_moved_is_told(tmp_path: Path) -> None:
+def test_diff_distance_moved(tmp_path: Path) -> None:
     ijk = blob(1, PLACE)
     shift = np.array([3, 0, -2])
     for name, voxels, transform in (
@@ -134,7 +134,7 @@ def test_how_far_a_part_has_moved_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rows_at_once", [1, 1 << 14])
 @pytest.mark.parametrize("curve", ["z", "hilbert"])
-def test_distances_are_compared_where_both_have_them(
+def test_diff_distances_on_both_sides(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, curve: CurveName, rows_at_once: int
 ) -> None:
     """On any curve. Objects that have them on one side alone do not differ."""

@@ -62,7 +62,7 @@ def write_balls(path: Path, *placed: NDArray[np.float64]) -> Path:
     return gltf(tree, path, vertices.astype(np.float32), faces.ravel().tolist())
 
 
-def test_objects_are_those_of_the_newest_revision(env: Environment, tmp_path: Path) -> None:
+def test_objects_newest_revision(env: Environment, tmp_path: Path) -> None:
     ids = [obj.id for obj in env.objects()]
     with hapticdb.open(tmp_path / "e.db") as other:
         other.remove(ids[1])
@@ -74,7 +74,7 @@ def test_objects_are_those_of_the_newest_revision(env: Environment, tmp_path: Pa
     assert [obj.id for obj in env.objects()] == [ids[0], *ids[3:]]
 
 
-def test_a_list_that_failed_is_read_again(
+def test_objects_reread_after_error(
     env: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = env.objects()
@@ -98,9 +98,7 @@ def test_a_list_that_failed_is_read_again(
 
 
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
-def test_a_moved_object_is_as_if_imported_there(
-    tmp_path: Path, layout: Layout, curve: CurveName
-) -> None:
+def test_move_equals_import_at_new_pose(tmp_path: Path, layout: Layout, curve: CurveName) -> None:
     (tmp_path / "there").mkdir()
     here = write_balls(tmp_path / "balls.gltf", placement(0, 0, 0), placement(0.02, 0, 0))
     there = write_balls(tmp_path / "there" / "balls.gltf", ELSEWHERE, placement(0.02, 0, 0))
@@ -134,7 +132,7 @@ def test_a_moved_object_is_as_if_imported_there(
         assert index_rows(env) == before
 
 
-def test_any_series_of_moves_ends_as_a_fresh_import(tmp_path: Path) -> None:
+def test_move_random_series_equals_fresh_import(tmp_path: Path) -> None:
     """No row of an earlier place remains, even when that place was at the grid's border."""
     rng = np.random.default_rng(11)
     n_balls = 3
@@ -153,7 +151,7 @@ def test_any_series_of_moves_ends_as_a_fresh_import(tmp_path: Path) -> None:
         assert index_rows(env) == index_rows(fresh)
 
 
-def test_a_move_reads_the_file_in_the_unit_that_it_was_imported_in(tmp_path: Path) -> None:
+def test_move_unit_of_import(tmp_path: Path) -> None:
     block = write_obj(tmp_path / "block.obj", {"ball": ball((0, 0, 0), 40)})
     with hapticdb.create(tmp_path / "e.db", small_grid()) as env:
         env.add(block, unit="mm")
@@ -164,7 +162,7 @@ def test_a_move_reads_the_file_in_the_unit_that_it_was_imported_in(tmp_path: Pat
         assert voxel_set(env.voxels(1)) == oracle_voxels(part, env.grid)
 
 
-def test_an_imported_environment_needs_its_files_no_more(env: Environment) -> None:
+def test_environment_independent_of_its_files(env: Environment) -> None:
     """Tools of parts, moves and removals, of the last object of a shape, too."""
     assert len(env.shell(1, 3, points=200)) == 200
     before = index_rows(env)
@@ -181,7 +179,7 @@ def test_an_imported_environment_needs_its_files_no_more(env: Environment) -> No
     assert check_environment(env.url).findings == []
 
 
-def test_an_object_without_a_surface_is_told_in_one_line(env: Environment) -> None:
+def test_move_object_without_surface(env: Environment) -> None:
     drop_surfaces(env.url)
     before = rows_of(Path(env.url))
     for edit in (env.shell, lambda number: env.move(number, ELSEWHERE)):
@@ -196,7 +194,7 @@ def test_an_object_without_a_surface_is_told_in_one_line(env: Environment) -> No
     assert all(finding.endswith("has no surface") for finding in report.findings)
 
 
-def test_a_placement_out_of_the_grid_or_that_is_none_is_refused(env: Environment) -> None:
+def test_move_bad_or_outside_grid(env: Environment) -> None:
     before = rows_of(Path(env.url))
     for far in (placement(0.3, 0, 0), placement(0, 0, -0.3), placement(1e300, 0, 0)):
         with pytest.raises(hapticdb.errors.OutsideGridError, match="part 'ball 0' spans"):
@@ -211,7 +209,7 @@ def test_a_placement_out_of_the_grid_or_that_is_none_is_refused(env: Environment
 
 
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
-def test_a_move_by_another_while_the_part_is_read_leaves_no_stray_rows(
+def test_move_concurrent_leaves_no_stray_rows(
     tmp_path: Path, layout: Layout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two editors move one object at once: it ends at the place of the last writer only."""
@@ -236,7 +234,7 @@ def test_a_move_by_another_while_the_part_is_read_leaves_no_stray_rows(
     assert not index_rows(env)
 
 
-def test_an_environment_opened_to_read_refuses_every_write(env: Environment) -> None:
+def test_read_only_environment_refuses_writes(env: Environment) -> None:
     before, file = rows_of(Path(env.url)), Path(env.url).with_name("more.obj")
     write_obj(file, assembly(1))
     reader = hapticdb.open(env.url, read_only=True)
@@ -250,7 +248,7 @@ def test_an_environment_opened_to_read_refuses_every_write(env: Environment) -> 
     assert rows_of(Path(env.url)) == before
 
 
-def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointShell) -> None:
+def test_calibrate_stored_for_machine(env: Environment, sphere: PointShell) -> None:
     costs = env.calibrate()
     assert env.store.costs(machine_name()) == costs.figures()
     figures = [value for name, value in costs.figures().items() if "spread" not in name]
@@ -265,9 +263,7 @@ def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointS
     assert env.store.costs(machine_name()) == costs.figures()
 
 
-def test_an_empty_environment_is_felt_and_not_calibrated(
-    tmp_path: Path, sphere: PointShell
-) -> None:
+def test_calibrate_empty_environment(tmp_path: Path, sphere: PointShell) -> None:
     with hapticdb.create(tmp_path / "e.db", small_grid()) as env:
         touch = env.touch(sphere, np.eye(4))
         assert not touch.force.any()

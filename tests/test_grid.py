@@ -29,7 +29,7 @@ def center_of(grid: Grid) -> NDArray[np.float64]:
     corner=st.lists(st.integers(-(2**12), 2**12), min_size=3, max_size=3),
     place=st.lists(st.integers(0, 255), min_size=3, max_size=3),
 )
-def test_voxels_are_half_open(ijk: list[int], corner: list[int], place: list[int]) -> None:
+def test_voxels_of_half_open(ijk: list[int], corner: list[int], place: list[int]) -> None:
     """A point on a border belongs to the upper voxel. Sizes are exact in binary here."""
     size = 2.0**-8
     x, y, z = (size * c for c in corner)
@@ -45,7 +45,7 @@ def test_voxels_are_half_open(ijk: list[int], corner: list[int], place: list[int
     origin=st.tuples(*[st.floats(-100, 100)] * 3),
     ijk=st.lists(st.integers(0, 2**10 - 1), min_size=3, max_size=3),
 )
-def test_the_center_of_a_voxel_lies_in_it(
+def test_centers_inside_their_voxels(
     size: float, origin: tuple[float, float, float], ijk: list[int]
 ) -> None:
     grid = Grid(size, origin, 10)
@@ -54,7 +54,7 @@ def test_the_center_of_a_voxel_lies_in_it(
 
 @pytest.mark.parametrize("bits", [1, 21])
 @pytest.mark.parametrize("curve", CURVE_NAMES)
-def test_voxels_and_keys_outside_the_grid_are_refused(curve: CurveName, bits: int) -> None:
+def test_encode_decode_outside_grid(curve: CurveName, bits: int) -> None:
     grid = Grid(1.0, (0, 0, 0), bits, curve)
     for axis, value in itertools.product(range(3), (-1, grid.side)):
         voxel = [0, 0, 0]
@@ -80,7 +80,7 @@ def test_voxels_and_keys_outside_the_grid_are_refused(curve: CurveName, bits: in
         ((1.0, (0, 0, 0), 4, "peano"), "choose one of"),
     ],
 )  # fmt: skip
-def test_a_grid_that_cannot_be_is_refused(arguments: tuple[Any, ...], message: str) -> None:
+def test_grid_bad_arguments(arguments: tuple[Any, ...], message: str) -> None:
     with pytest.raises(GridError, match=message) as caught:
         Grid(*arguments)
     assert isinstance(caught.value, UsageError)
@@ -101,7 +101,7 @@ COMBINATIONS = [
 ]
 
 
-def test_every_combination_of_options_fits_as_it_says() -> None:
+def test_fit_all_combinations_of_options() -> None:
     for given_options in COMBINATIONS:
         grid = GridOptions(**given_options).fit(BOUNDS)
         bits, size, extent = (given_options[name] for name in ("bits", "voxel_size", "extent"))
@@ -122,7 +122,7 @@ def test_every_combination_of_options_fits_as_it_says() -> None:
         GridOptions(**given_options).check_matches(grid, BOUNDS)
 
 
-def test_a_voxel_size_too_small_for_the_scene_is_refused() -> None:
+def test_fit_voxel_size_too_small() -> None:
     with pytest.raises(GridError, match=r"needs 23 bits an axis .* the most is 21"):
         GridOptions(voxel_size=1e-6).fit(BOUNDS)
     finest = ROOM * LONGEST / 2**21
@@ -139,14 +139,12 @@ def test_a_voxel_size_too_small_for_the_scene_is_refused() -> None:
         ({"origin": (1.0, 2.0, math.inf)}, "three finite"), ({"curve": "peano"}, "choose one of"),
     ],
 )  # fmt: skip
-def test_options_that_cannot_be_are_refused_before_a_file_is_read(
-    options: dict[str, Any], message: str
-) -> None:
+def test_grid_options_bad_values(options: dict[str, Any], message: str) -> None:
     with pytest.raises(GridError, match=message):
         GridOptions(**options)
 
 
-def test_a_single_point_needs_a_voxel_size() -> None:
+def test_fit_single_point_needs_voxel_size() -> None:
     point = np.array([[1.0, 2.0, 3.0]] * 2)
     for options in (GridOptions(), GridOptions(extent=1.6), GridOptions(bits=8)):
         with pytest.raises(GridError, match="single point: give --voxel-size"):
@@ -157,7 +155,7 @@ def test_a_single_point_needs_a_voxel_size() -> None:
         assert grid.contains(grid.voxels_of(point)).all()
 
 
-def test_bounds_that_overflow_are_refused() -> None:
+def test_fit_overflowing_bounds() -> None:
     with pytest.raises(GridError), np.errstate(all="ignore"):
         GridOptions().fit(np.array([[-1e308] * 3, [1e308] * 3]))
 
@@ -165,7 +163,7 @@ def test_bounds_that_overflow_are_refused() -> None:
 KNOWN = Grid(0.01, (-1.0, 0.0, 2.0), 9, "hilbert")
 
 
-def test_equal_options_are_accepted() -> None:
+def test_check_matches_equal_options() -> None:
     options: tuple[dict[str, Any], ...] = (
         {},
         {"voxel_size": 0.1 * 0.1},  # the same length, rounded differently
@@ -184,12 +182,12 @@ def test_equal_options_are_accepted() -> None:
         ({"origin": (-1.0, 0.0, 2.001)}, r"origin \(-1.0, 0.0, 2.001\) instead of"),
     ],
 )
-def test_differing_options_are_refused_by_name(options: dict[str, Any], message: str) -> None:
+def test_check_matches_names_differing_options(options: dict[str, Any], message: str) -> None:
     with pytest.raises(GridError, match=f"another grid: .*{message}"):
         GridOptions(**options).check_matches(KNOWN)
 
 
-def test_an_extent_is_compared_by_the_edge_that_it_gives() -> None:
+def test_check_matches_extent_by_edge() -> None:
     grid = GridOptions(bits=11, extent=1.6).fit(BOUNDS)
     GridOptions(bits=11, extent=1.6).check_matches(grid, BOUNDS)
     with pytest.raises(GridError, match=r"extent 1\.7"):

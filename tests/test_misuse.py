@@ -22,9 +22,7 @@ def env(tmp_path: Path) -> Environment:
     return env
 
 
-def test_an_id_of_another_type_or_that_no_object_has_is_refused(
-    env: Environment, sphere: PointShell
-) -> None:
+def test_ids_bad_type_or_missing_object(env: Environment, sphere: PointShell) -> None:
     wrong: tuple[Any, ...] = ("1", 1.7, None, [1], True)
     for ask in (env.voxels, env.object, env.remove):
         for one in wrong:
@@ -40,9 +38,7 @@ def test_an_id_of_another_type_or_that_no_object_has_is_refused(
     assert len(env.voxels(np.int64(1))) == env.object(1).voxels  # type: ignore[arg-type]
 
 
-def test_exclude_takes_any_collection_and_no_single_id(
-    env: Environment, sphere: PointShell
-) -> None:
+def test_touch_exclude_collections(env: Environment, sphere: PointShell) -> None:
     empties: list[Any] = [(), [], np.array([], dtype=np.int64), set(), iter(())]
     for nobody in empties:
         assert len(env.touch(sphere, np.eye(4), exclude=nobody).hits)
@@ -54,13 +50,13 @@ def test_exclude_takes_any_collection_and_no_single_id(
             env.touch(sphere, np.eye(4), exclude=wrong)
 
 
-def test_maxgap_is_checked_whatever_the_strategy(env: Environment, sphere: PointShell) -> None:
+def test_touch_maxgap_checked_for_any_strategy(env: Environment, sphere: PointShell) -> None:
     for strategy in ("auto", "points", "maxgap"):
         with pytest.raises(hapticdb.errors.UsageError, match="MAXGAP -1"):
             env.touch(sphere, np.eye(4), strategy, maxgap=-1)
 
 
-def test_another_thread_is_told_to_open_its_own(env: Environment, sphere: PointShell) -> None:
+def test_environment_other_thread_refused(env: Environment, sphere: PointShell) -> None:
     told: list[str] = []
 
     def use() -> None:
@@ -76,16 +72,14 @@ def test_another_thread_is_told_to_open_its_own(env: Environment, sphere: PointS
     assert len(env.objects()) == 1
 
 
-def test_files_are_a_list(tmp_path: Path) -> None:
+def test_import_files_needs_list(tmp_path: Path) -> None:
     with pytest.raises(hapticdb.errors.UsageError, match="give a list"):
         hapticdb.import_files(tmp_path / "x.db", "part.stl")
     with pytest.raises(hapticdb.errors.UsageError, match="no files"):
         hapticdb.import_files(tmp_path / "x.db", [])
 
 
-def test_what_is_no_file_is_refused_before_anything_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_create_not_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for url in (":memory:", "file:e.db", "", "mysql://host/e"):
         with pytest.raises(hapticdb.errors.UsageError):
@@ -93,7 +87,7 @@ def test_what_is_no_file_is_refused_before_anything_is_made(
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_no_array_of_real_numbers_is_no_pose(env: Environment, sphere: PointShell) -> None:
+def test_poses_not_real_arrays(env: Environment, sphere: PointShell) -> None:
     given: tuple[tuple[Any, str], ...] = (
         (np.eye(4) * 1j, "complex128"), ([[1, 2], [3]], "object"), (np.eye(4) == 1.0, "bool"),
         (np.ma.masked_array(np.eye(4), mask=np.eye(4) == 1.0), "masked"),
@@ -112,13 +106,13 @@ def test_what_is_no_array_of_real_numbers_is_no_pose(env: Environment, sphere: P
                 ask(wrong)
 
 
-def test_integers_and_lists_are_poses(env: Environment, sphere: PointShell) -> None:
+def test_poses_integers_and_lists(env: Environment, sphere: PointShell) -> None:
     wanted = env.touch(sphere, np.eye(4)).force
     for pose in (np.eye(4, dtype=np.int32), np.eye(4).tolist(), np.asfortranarray(np.eye(4))):
         assert (env.touch(sphere, pose).force == wanted).all()
 
 
-def test_points_and_seeds_are_whole_numbers() -> None:
+def test_shell_points_and_seed_integers() -> None:
     given: tuple[Any, ...] = (1.5, "12", True, None, np.float64(3))
     for wrong in given:
         with pytest.raises(hapticdb.errors.UsageError, match="whole number"):
@@ -128,7 +122,7 @@ def test_points_and_seeds_are_whole_numbers() -> None:
     assert len(PointShell.sphere(0.5, np.int64(12))) == 12  # type: ignore[arg-type]
 
 
-def test_a_forked_process_is_told_to_open_its_own(env: Environment, sphere: PointShell) -> None:
+def test_environment_forked_process_refused(env: Environment, sphere: PointShell) -> None:
     """Two processes that share one SQLite connection would damage the file."""
     answer, question = os.pipe()
     pid = os.fork()

@@ -13,7 +13,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.session.coupling import limit_text
 
 
-def test_one_tool_feels_the_same_by_command_library_and_page(run: Run, scene: Path) -> None:
+def test_tool_same_force_in_verb_library_page(run: Run, scene: Path) -> None:
     path = hapticdb.read_poses(poses(scene.parent / "in.csv", (0.0, 0.0, 0.055)))
     command = json.loads(
         run("touch", scene, "--tool", "tool.stl", "--poses", "in.csv", "--json")[1]
@@ -43,11 +43,11 @@ def test_one_tool_feels_the_same_by_command_library_and_page(run: Run, scene: Pa
 
 
 @pytest.mark.parametrize(("newtons", "words"), [(7.0, ", at its limit"), (6.9, "")])
-def test_a_force_at_the_devices_cap_is_told(newtons: float, words: str) -> None:
+def test_limit_text_at_cap(newtons: float, words: str) -> None:
     assert limit_text(newtons, 7.0) == words
 
 
-def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> None:
+def test_results_repr_and_plot(scene: Path) -> None:
     with hapticdb.open(scene) as env:
         tool = env.tool("tool.stl")
         path = hapticdb.read_poses("path.csv")

@@ -33,7 +33,7 @@ quaternions = arrays(np.float64, (5, 4), elements=components).filter(
 
 
 @given(quaternions)
-def test_a_rotation_comes_back_from_its_quaternion(q: NDArray[np.float64]) -> None:
+def test_quaternion_of_inverts_rotation_of(q: NDArray[np.float64]) -> None:
     unit = q / np.linalg.norm(q, axis=1, keepdims=True)
     rotation = rotation_of(unit)
     assert np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-12)
@@ -42,13 +42,13 @@ def test_a_rotation_comes_back_from_its_quaternion(q: NDArray[np.float64]) -> No
     assert np.allclose(np.abs((quaternion_of(rotation) * unit).sum(axis=1)), 1.0, atol=1e-12)
 
 
-def test_the_scalar_comes_first_and_turns_are_right_handed() -> None:
+def test_rotation_of_scalar_first_right_handed() -> None:
     quarter = rotation_of([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])[0]
     assert np.allclose(quarter @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
 
 
 @given(quaternions, arrays(np.float64, (5, 3), elements=st.floats(-1e6, 1e6)))
-def test_poses_come_back_from_a_file(
+def test_write_poses_round_trip(
     tmp_path_factory: pytest.TempPathFactory, q: NDArray[np.float64], p: NDArray[np.float64]
 ) -> None:
     poses = np.tile(np.eye(4), (5, 1, 1))
@@ -73,9 +73,7 @@ def test_poses_come_back_from_a_file(
         b'"x","y","z","qw","qx","qy","qz"\n"1","2","3","1","0","0","0"',
     ],
 )
-def test_marks_line_ends_blanks_quotes_and_order_do_not_matter(
-    tmp_path: Path, content: bytes
-) -> None:
+def test_read_poses_csv_variants(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "p.csv"
     path.write_bytes(content)
     assert np.array_equal(read_poses(path)[0, :3, 3], [1.0, 2.0, 3.0])
@@ -103,7 +101,7 @@ def test_marks_line_ends_blanks_quotes_and_order_do_not_matter(
         (ROWS + b'"1,2,3,1,0,0,0\n', "line 2"),
     ],
 )
-def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path, content: bytes, says: str) -> None:
+def test_read_poses_bad_file(tmp_path: Path, content: bytes, says: str) -> None:
     path = tmp_path / "p.csv"
     path.write_bytes(content)
     with pytest.raises(FileError) as caught:
@@ -114,13 +112,13 @@ def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path, content: bytes,
     assert "\n" not in message
 
 
-def test_a_missing_file_and_a_folder_are_told_apart(tmp_path: Path) -> None:
+def test_read_poses_missing_file_and_folder(tmp_path: Path) -> None:
     for path, words in ((tmp_path / "none.csv", "no file of poses"), (tmp_path, "cannot read")):
         with pytest.raises(FileError, match=words):
             read_poses(path)
 
 
-def test_what_is_no_list_of_poses_is_not_written(tmp_path: Path) -> None:
+def test_write_poses_bad_input(tmp_path: Path) -> None:
     for poses in (np.eye(4), np.full((1, 4, 4), np.nan)):
         with pytest.raises(UsageError):
             write_poses(tmp_path / "p.csv", poses)
@@ -129,7 +127,7 @@ def test_what_is_no_list_of_poses_is_not_written(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_times_come_with_the_poses_where_the_file_has_them(tmp_path: Path) -> None:
+def test_read_timed_poses_optional_times(tmp_path: Path) -> None:
     path = tmp_path / "p.csv"
     path.write_text("T,qw,qx,qy,qz,x,y,z\n-1,2,0,0,0,1,2,3\n0.5,1,0,0,0,4,5,6\n")
     times, poses = read_timed_poses(path)
@@ -149,9 +147,7 @@ def test_times_come_with_the_poses_where_the_file_has_them(tmp_path: Path) -> No
         ("0,0,0,1,0,0,0\n", "line 2: no value for t"),
     ],
 )
-def test_times_that_cannot_be_are_told_only_where_times_are_asked_for(
-    tmp_path: Path, rows: str, says: str
-) -> None:
+def test_read_timed_poses_bad_times(tmp_path: Path, rows: str, says: str) -> None:
     path = tmp_path / "p.csv"
     path.write_text("x,y,z,qw,qx,qy,qz,t\n" + rows)
     with pytest.raises(FileError, match=says) as caught:
@@ -176,7 +172,7 @@ TURN = [0.0, 0.6, 0.0, 0.8]
         ("named.txt", "qx qy qz qw x y z\n0 0.6 0 0.8 1 2 3\n", None),
     ],
 )
-def test_paths_of_other_programs_are_read(
+def test_read_poses_of_other_programs(
     tmp_path: Path, name: str, text: str, order: Order | None
 ) -> None:
     (tmp_path / name).write_text(text)
@@ -184,7 +180,7 @@ def test_paths_of_other_programs_are_read(
     assert np.allclose(read_poses(tmp_path / name, order=order), expected, atol=1e-15)
 
 
-def test_arrays_are_read(tmp_path: Path) -> None:
+def test_read_poses_npy(tmp_path: Path) -> None:
     path = tmp_path / "poses.npy"
     expected = np.stack([np.eye(4), pose_of_row([1.0, 2.0, 3.0], np.roll(TURN, 1))])
     np.save(path, expected)
@@ -224,7 +220,7 @@ UPRIGHT, TURNED = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.6, 0.8)
         ([(0, 0, 1, 0), TURNED], False),
     ],
 )
-def test_quaternions_in_another_order_than_their_names_are_told_and_half_turns_are_not(
+def test_read_poses_quaternion_order_warning(
     tmp_path: Path, rows: list[tuple[float, ...]], is_doubted: bool
 ) -> None:
     path = tmp_path / "path.csv"

@@ -43,16 +43,14 @@ def assert_rigid(poses: Floats) -> None:
     assert np.array_equal(poses[:, 3], np.tile([0.0, 0.0, 0.0, 1.0], (len(poses), 1)))
 
 
-def test_the_car_is_read_as_closed_parts_of_distinct_names(files: SampleFiles) -> None:
+def test_sample_car_closed_distinct_parts(files: SampleFiles) -> None:
     car = parse_in_process(files.car)
     assert len({part.name for part in car.parts}) == len(car.parts) == 217
     assert car.defects == Defects()
     assert np.ptp(car.bounds, axis=0) == pytest.approx([4.28, 2.04, 1.72], abs=0.02)
 
 
-def test_clashes_finds_the_two_planted_overlaps_and_the_rules_leave_one(
-    files: SampleFiles, tmp_path: Path
-) -> None:
+def test_sample_clashes_and_rules(files: SampleFiles, tmp_path: Path) -> None:
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6), distances=False)
     hapticdb.import_files(tmp_path / "car.db", [files.car], options)
     with hapticdb.open(tmp_path / "car.db") as env:
@@ -67,14 +65,14 @@ def test_clashes_finds_the_two_planted_overlaps_and_the_rules_leave_one(
     assert left == {("frame/cross_member_middle", "supply/fuel_line")}
 
 
-def test_the_spanner_is_one_closed_piece(files: SampleFiles) -> None:
+def test_sample_spanner_one_closed_body(files: SampleFiles) -> None:
     mesh = trimesh.load_mesh(files.spanner)
     assert mesh.is_volume
     assert mesh.body_count == 1
     assert mesh.extents == pytest.approx([0.25, 0.054, 0.010], abs=0.003)
 
 
-def test_the_path_is_smooth_and_comes_down_from_above(files: SampleFiles, spanner: Floats) -> None:
+def test_sample_path_smooth_from_above(files: SampleFiles, spanner: Floats) -> None:
     poses = read_poses(files.path)
     assert len(poses) == 1000
     assert_rigid(poses)
@@ -84,9 +82,7 @@ def test_the_path_is_smooth_and_comes_down_from_above(files: SampleFiles, spanne
 
 
 @pytest.mark.parametrize("count", [1, 7, 999])
-def test_fewer_poses_are_spread_over_the_whole_path(
-    files: SampleFiles, tmp_path: Path, count: int
-) -> None:
+def test_write_sample_fewer_poses(files: SampleFiles, tmp_path: Path, count: int) -> None:
     whole = files.path.read_text().splitlines()
     fewer = write_sample(tmp_path, count).path.read_text().splitlines()
     assert fewer[:2] == whole[:2]
@@ -94,7 +90,7 @@ def test_fewer_poses_are_spread_over_the_whole_path(
     assert count == 1 or fewer[-1] == whole[-1]
 
 
-def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_write_sample_bad_arguments(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(FileError, match="file"):
         write_sample(tmp_path / "file")

@@ -39,7 +39,7 @@ def clashes(tmp_path: Path) -> hapticdb.Clashes:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
-def test_tables_come_back_from_files(tmp_path: Path, suffix: str) -> None:
+def test_tabular_write_round_trip(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"table{suffix}"
     if suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         with pytest.raises(MissingExtraError, match="pip install"):
@@ -79,13 +79,13 @@ def is_same(one: object, wanted: object, *, is_csv: bool) -> bool:
     return (float(one) if is_csv else one) == wanted  # type: ignore[arg-type]
 
 
-def test_names_of_columns_are_those_of_the_command_line(tmp_path: Path) -> None:
+def test_tabular_column_names_of_command_line(tmp_path: Path) -> None:
     names = {name for result in (touches(), clashes(tmp_path)) for name in result.columns()}
     assert {*WRENCH, *COLUMNS["touched"], *COLUMNS["places"], "deepest_m"} < names
     assert touches().columns()["touched_names"] == ["", "=bolt; nut"]
 
 
-def test_a_dataframe_needs_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_to_pandas_needs_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingExtraError, match=r"to_pandas.* pip install pandas$"):
         clearances().to_pandas()
@@ -93,7 +93,7 @@ def test_a_dataframe_needs_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
     assert clearances().to_pandas()["distance_m"].tolist() == [1 / 3, np.inf]
 
 
-def test_a_table_is_not_written_where_it_cannot_be(tmp_path: Path) -> None:
+def test_tabular_write_bad_path(tmp_path: Path) -> None:
     result: Tabular = clearances()
     with pytest.raises(UsageError, match=r"\.csv, \.parquet, \.npz"):
         result.write(tmp_path / "table.xlsx")

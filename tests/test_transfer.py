@@ -58,7 +58,7 @@ def scattered(draw: st.DrawFn, bits: int) -> NDArray[np.int64]:
 
 @pytest.mark.parametrize("most_rows", [1, 1 << 19])
 @pytest.mark.parametrize(("kind", "other"), PAIRS, ids=str)
-def test_voxels_come_back_from_every_layout_and_curve(
+def test_copy_environment_layouts_and_curves_round_trip(
     monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
 ) -> None:
     """A copy and a copy back, in one batch and in many, also on grids smaller than a brick."""
@@ -85,7 +85,7 @@ def test_voxels_come_back_from_every_layout_and_curve(
     there_and_back()
 
 
-def test_an_object_keeps_everything_but_its_revision(tmp_path: Path) -> None:
+def test_copy_environment_all_object_fields(tmp_path: Path) -> None:
     source = tmp_path / "a.db"
     with make(source) as env:
         ijk = blob(1, PLACES[0])
@@ -102,9 +102,7 @@ def test_an_object_keeps_everything_but_its_revision(tmp_path: Path) -> None:
     assert right.id == 7
 
 
-def test_no_statement_brings_more_than_a_batch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_copy_environment_batch_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = make_blobs(tmp_path / "a.db")
     monkeypatch.setattr(geometry, "MOST_ROWS", 8)
     brought: list[int] = []
@@ -122,7 +120,7 @@ def test_no_statement_brings_more_than_a_batch(
     assert diff_environments(source, tmp_path / "b.db").is_equal
 
 
-def test_an_id_that_is_taken_is_exchanged(tmp_path: Path) -> None:
+def test_copy_environment_taken_id_renumbered(tmp_path: Path) -> None:
     source = make_blobs(tmp_path / "a.db")
     with make(tmp_path / "b.db", ("voxel", "hilbert")) as env:
         for n in range(3):
@@ -147,9 +145,7 @@ def test_an_id_that_is_taken_is_exchanged(tmp_path: Path) -> None:
         ("UPDATE object SET voxels = 7 WHERE id = 5", "with 7 voxels instead of"),
     ],
 )
-def test_the_same_part_otherwise_is_a_conflict_before_anything_is_written(
-    tmp_path: Path, sql: str, word: str
-) -> None:
+def test_copy_environment_conflict_before_writing(tmp_path: Path, sql: str, word: str) -> None:
     source = make_blobs(tmp_path / "a.db")
     copy_environment(source, tmp_path / "b.db")
     change(
@@ -162,7 +158,7 @@ def test_the_same_part_otherwise_is_a_conflict_before_anything_is_written(
 
 
 @pytest.mark.parametrize("spelling", ["{0}", "sqlite:///{0}", "{1}/x/../a.db", "{1}/link.db"])
-def test_an_environment_is_not_copied_onto_itself(tmp_path: Path, spelling: str) -> None:
+def test_copy_environment_onto_itself(tmp_path: Path, spelling: str) -> None:
     source = make_blobs(tmp_path / "a.db")
     (tmp_path / "x").mkdir()
     (tmp_path / "link.db").symlink_to(source)
@@ -172,7 +168,7 @@ def test_an_environment_is_not_copied_onto_itself(tmp_path: Path, spelling: str)
     assert rows_of(source) == before
 
 
-def test_a_target_of_another_grid_is_refused(tmp_path: Path) -> None:
+def test_copy_environment_other_grid(tmp_path: Path) -> None:
     source = make_blobs(tmp_path / "a.db")
     hapticdb.create(tmp_path / "b.db", Grid(0.010001, (-0.1, 0.2, -0.3), 5)).close()
     with pytest.raises(hapticdb.errors.GridError, match="another grid"):
@@ -186,7 +182,7 @@ def test_a_target_of_another_grid_is_refused(tmp_path: Path) -> None:
     ("asked", "word"),
     [({"layout": "voxel"}, "has the layout brick"), ({"curve": "hilbert"}, "has the curve z")],
 )
-def test_a_target_of_another_kind_than_asked_is_refused(
+def test_copy_environment_other_layout_or_curve(
     tmp_path: Path, asked: dict[str, Any], word: str
 ) -> None:
     source = make_blobs(tmp_path / "a.db", ("voxel", "hilbert"))
@@ -205,7 +201,7 @@ def test_a_target_of_another_kind_than_asked_is_refused(
         (("brick", "z"), {"layout": "heap"}, "heap"),
     ],
 )
-def test_what_cannot_be_made_is_refused_before_anything_is_made(
+def test_copy_environment_impossible_target(
     tmp_path: Path, kind: Kind, asked: dict[str, Any], word: str
 ) -> None:
     source = make_blobs(tmp_path / "a.db", kind)
@@ -215,7 +211,7 @@ def test_what_cannot_be_made_is_refused_before_anything_is_made(
     assert set(left_behind(tmp_path)) - {"a.db-wal", "a.db-shm"} == set(before)
 
 
-def test_a_damaged_object_is_told_and_an_empty_target_discarded(tmp_path: Path) -> None:
+def test_copy_environment_damaged_object(tmp_path: Path) -> None:
     source = make_blobs(tmp_path / "a.db", ("voxel", "z"))
     change(source, "DELETE FROM voxel WHERE z_val = (SELECT min(z_val) FROM voxel WHERE id = 2)")
     with pytest.raises(
@@ -225,7 +221,7 @@ def test_a_damaged_object_is_told_and_an_empty_target_discarded(tmp_path: Path) 
     assert not (tmp_path / "b.db").exists()
 
 
-def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
+def test_copy_environment_concurrent_edits(tmp_path: Path) -> None:
     """A copy has the revision at which it began; started again, it reports the conflict."""
     source = make_blobs(tmp_path / "a.db")
     copy_environment(source, tmp_path / "before.db")
@@ -251,7 +247,7 @@ def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
         copy_environment(source, tmp_path / "b.db")
 
 
-def test_two_copies_at_once_make_one(tmp_path: Path) -> None:
+def test_copy_environment_two_at_once(tmp_path: Path) -> None:
     """The slower copy finds and accepts the objects that the faster one has written."""
     source = make_blobs(tmp_path / "a.db")
 
@@ -273,7 +269,7 @@ def with_packed(ijk: NDArray[np.int64], grid: Grid, seed: int) -> Rows:
 
 
 @pytest.mark.parametrize("curves", [("z", "z"), ("z", "hilbert"), ("hilbert", "z")])
-def test_distances_are_copied_as_they_are_where_they_are_wanted(
+def test_copy_environment_distances_by_target(
     tmp_path: Path, curves: tuple[CurveName, CurveName]
 ) -> None:
     """Of objects that have them. A target that does not want them gets the voxels alone."""

@@ -44,7 +44,7 @@ def cloud(path: Path, wkt: str = "") -> Path:
     return path
 
 
-def test_feet_are_taken_wherever_a_unit_is(run: Run, tmp_path: Path) -> None:
+def test_unit_feet_in_every_verb(run: Run, tmp_path: Path) -> None:
     trimesh.creation.box(extents=(2, 2, 2)).export(tmp_path / "tool.stl")
     (tmp_path / "path.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n")
     assert run("import", "a.db", "tool.stl", "--unit", "ft", "--bits", 6)[0] == 0
@@ -54,7 +54,7 @@ def test_feet_are_taken_wherever_a_unit_is(run: Run, tmp_path: Path) -> None:
     assert run("feel", *tool, "--device", "path.csv", "--seconds", 0.1, "--rate", 200)[0] == 0
 
 
-def test_the_scene_is_told_in_metres(run: Run, tmp_path: Path) -> None:
+def test_info_scene_in_metres(run: Run, tmp_path: Path) -> None:
     box = trimesh.creation.box(bounds=[(10, 20, 30), (14, 22, 31)])
     box.export(tmp_path / "a.stl")
     hapticdb.create(tmp_path / "a.db", hapticdb.Grid(0.2, (0, 0, 0), 6)).close()
@@ -73,7 +73,7 @@ def test_the_scene_is_told_in_metres(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.stl", "a.glb"])
-def test_an_import_says_when_it_took_metres(run: Run, tmp_path: Path, name: str) -> None:
+def test_import_assumed_metres_note(run: Run, tmp_path: Path, name: str) -> None:
     made: dict[str, Callable[[Path], Path]] = {"a.las": cloud, "a.stl": stl, "a.glb": boxes}
     file = made[name](tmp_path / name)
     told = "its unit is not known: its numbers are taken as metres; --unit gives another"
@@ -98,7 +98,7 @@ def test_an_import_says_when_it_took_metres(run: Run, tmp_path: Path, name: str)
         ('PROJCS["cut",', None, 1.0, False, "the unit of its reference system cannot be read"),
     ],
 )  # fmt: skip
-def test_a_point_cloud_is_in_the_unit_of_its_reference_system(
+def test_las_unit_of_reference_system(
     tmp_path: Path, wkt: str, unit: str | None, metres: float, names_unit: bool, note: str
 ) -> None:
     file = parse_in_process(cloud(tmp_path / "a.las", wkt), unit=unit)
@@ -109,7 +109,7 @@ def test_a_point_cloud_is_in_the_unit_of_its_reference_system(
     assert file.names_unit == names_unit
 
 
-def test_no_axis_points_up_in_geocentric_metres(tmp_path: Path) -> None:
+def test_las_geocentric_no_up_axis(tmp_path: Path) -> None:
     datum = DEGREES.partition(",UNIT")[0].partition(",")[2]
     file = parse_in_process(cloud(tmp_path / "a.las", f'GEOCCS["c",{datum},UNIT["metre",1]]'))
     assert file.names_unit
@@ -117,7 +117,7 @@ def test_no_axis_points_up_in_geocentric_metres(tmp_path: Path) -> None:
     assert parse_in_process(cloud(tmp_path / "b.las")).up == "z"
 
 
-def test_degrees_are_refused_by_name_unless_a_unit_is_given(tmp_path: Path) -> None:
+def test_las_degrees_refused_without_unit(tmp_path: Path) -> None:
     with pytest.raises(hapticdb.errors.FileError, match=r"degrees \(g\), which are no lengths"):
         parse_in_process(cloud(tmp_path / "a.las", DEGREES))
     las = laspy.read(tmp_path / "a.las")
@@ -126,7 +126,7 @@ def test_degrees_are_refused_by_name_unless_a_unit_is_given(tmp_path: Path) -> N
     assert "which its numbers are not" in parse_in_process(tmp_path / "b.las").notes[0]
 
 
-def test_withheld_points_are_counted_and_a_cut_file_is_told(tmp_path: Path) -> None:
+def test_las_withheld_points_and_truncated_file(tmp_path: Path) -> None:
     las = laspy.read(cloud(tmp_path / "a.las"))
     las.withheld[:7] = 1
     las.write(tmp_path / "b.las")
@@ -146,9 +146,7 @@ def test_withheld_points_are_counted_and_a_cut_file_is_told(tmp_path: Path) -> N
         ({1024: 1, 3072: 2263, 4096: 5703}, 1 / FEET),
     ],
 )
-def test_geotiff_keys_name_a_unit_by_its_code_or_that_of_a_system(
-    tmp_path: Path, keys: dict[int, int], rise: float
-) -> None:
+def test_las_geotiff_unit_keys(tmp_path: Path, keys: dict[int, int], rise: float) -> None:
     las = laspy.read(cloud(tmp_path / "a.las"))
     record = GeoKeyDirectoryVlr()
     record.geo_keys_header.number_of_keys = len(keys)
@@ -169,9 +167,7 @@ def test_geotiff_keys_name_a_unit_by_its_code_or_that_of_a_system(
         ("b.dae", None, "y"),
     ],
 )
-def test_which_axis_points_up_comes_from_the_file(
-    tmp_path: Path, name: str, said: str | None, up: str | None
-) -> None:
+def test_up_axis_of_file(tmp_path: Path, name: str, said: str | None, up: str | None) -> None:
     file = tmp_path / name
     mesh = trimesh.creation.box()
     if name.endswith(".dae"):
@@ -188,13 +184,13 @@ def test_which_axis_points_up_comes_from_the_file(
         assert env.object(1).attributes.get("up") == up
 
 
-def test_an_unknown_unit_names_those_known(run: Run, tmp_path: Path) -> None:
+def test_unit_unknown(run: Run, tmp_path: Path) -> None:
     with pytest.raises(hapticdb.errors.UsageError, match=r"furlong.*ft"):
         read_file(stl(tmp_path / "a.stl"), unit="furlong")
     refused(run("import", "a.db", "a.stl", "--unit", "furlong"), "--unit")
 
 
-def test_places_are_told_as_fine_as_what_is_there() -> None:
+def test_place_text_precision_of_scene() -> None:
     assert place_text((5e5, 4649776.123456, 1.7e-17), 3e-6) == "(500000, 4649776.123456, 0)"
     assert place_text((-0.25, 1000.0, 0.0), 10.0) == "(0, 1000, 0)"
     assert place_text((-0.25, 1.0, 0.0), 0.0) == "(-0.25, 1, 0)"
@@ -213,16 +209,14 @@ def test_places_are_told_as_fine_as_what_is_there() -> None:
         ("0", "mm", 0.0),
     ],
 )  # fmt: skip
-def test_a_length_is_in_its_own_unit_or_that_of_the_option(
-    text: str, unit: str, metres: float
-) -> None:
+def test_length_of_units(text: str, unit: str, metres: float) -> None:
     assert length_of(text, unit) == metres
 
 
 @pytest.mark.parametrize(
     "text", ["", "mm", "1 furlong", "1,5", "nan", "inf", "1e999", "9" * 400, "1mm2", "5MM"]
 )
-def test_what_is_no_length_is_refused_with_the_forms_that_are_taken(text: str) -> None:
+def test_length_of_bad_text(text: str) -> None:
     with pytest.raises(hapticdb.errors.UsageError, match=r"give millimetres, or such as 0\.2in \("):
         length_of(text, "mm")
 
@@ -236,7 +230,7 @@ def test_angle_of_units() -> None:
             angle_of(text)
 
 
-def test_three_lengths_have_units_of_their_own_or_the_last_ones() -> None:
+def test_point_of_units() -> None:
     inch = 0.0254
     assert point_of("1,-2 0.5", "m") == (1, -2, 0.5)
     assert point_of("1e-3,2e1,3", "m") == (1e-3, 20, 3)
@@ -251,7 +245,7 @@ def test_three_lengths_have_units_of_their_own_or_the_last_ones() -> None:
 NO_LENGTHS = {"VOLUME", "SIZE", "ANGLE"}
 
 
-def test_every_length_among_the_options_shows_its_default_and_takes_a_unit() -> None:
+def test_length_options_defaults_and_units() -> None:
     """Defaults of verbs are metres, those in the help are in the option's unit."""
     found = set()
     for verb in VERBS:
@@ -269,7 +263,7 @@ def test_every_length_among_the_options_shows_its_default_and_takes_a_unit() -> 
     }
 
 
-def test_a_bad_length_is_one_line_that_names_the_option(run: Run) -> None:
+def test_length_options_bad_text(run: Run) -> None:
     for given in (
         ("clashes", "a.db", "--within", "wide"),
         ("sweep", "a.db", "--overlap", "1 parsec"),
@@ -283,16 +277,16 @@ def test_a_bad_length_is_one_line_that_names_the_option(run: Run) -> None:
 @pytest.mark.parametrize(
     ("text", "volume"), [("1", 1e-6), ("5mm3", 5e-9), (".2 m³", 0.2), ("2in^3", 2 * 0.0254**3)]
 )
-def test_volume_of(text: str, volume: float) -> None:
+def test_volume_of_units(text: str, volume: float) -> None:
     assert volume_of(text) == pytest.approx(volume, rel=1e-15)
 
 
 @pytest.mark.parametrize("text", ["1mm", "mm3", "1 l", "", "3 3"])
-def test_volume_of_refuses(text: str) -> None:
+def test_volume_of_bad_text(text: str) -> None:
     with pytest.raises(UsageError, match="is no volume"):
         volume_of(text)
 
 
-def test_volume_text() -> None:
+def test_volume_text_units() -> None:
     told = {7.2e-2: "0.072 m³", 7.2e-4: "720 cm³", 1.2e-9: "1.2 mm³", 0.0: "0 mm³"}
     assert {volume: volume_text(volume) for volume in told} == told

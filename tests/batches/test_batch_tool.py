@@ -12,7 +12,7 @@ from session.worlds import SIZE, block, cloud, make, move, poses_in, scatter
 from voxels import write_voxels
 
 
-def test_cells_stay_in_memory_between_calls_until_it_is_closed(tmp_path: Path) -> None:
+def test_batch_tool_reuses_cells_until_closed(tmp_path: Path) -> None:
     with make(tmp_path) as env:
         scatter(env)
         shell, poses = cloud(100), poses_in(env.grid, 50)
@@ -30,7 +30,7 @@ def test_cells_stay_in_memory_between_calls_until_it_is_closed(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("by", ["itself", "another"])
-def test_edits_between_calls_are_felt(tmp_path: Path, by: str) -> None:
+def test_batch_tool_sees_edits_between_calls(tmp_path: Path, by: str) -> None:
     with make(tmp_path) as env:
         write_voxels(env.store, block((0, 0, 0), (127, 127, 60)), "floor")
         shell, poses = cloud(100, extent=0.01), poses_in(env.grid, 30, beyond=0.0)
@@ -51,7 +51,7 @@ def test_edits_between_calls_are_felt(tmp_path: Path, by: str) -> None:
         assert near.distances == pytest.approx(env.clearance(shell, poses).distances, abs=1e-12)
 
 
-def test_words_are_read_again_after_an_edit(tmp_path: Path) -> None:
+def test_batch_tool_resolves_words_after_edit(tmp_path: Path) -> None:
     with make(tmp_path, 6) as env:
         write_voxels(env.store, block((0, 0, 0), (63, 63, 31)), "floor")
         shell, poses = cloud(20, extent=0.01), poses_in(env.grid, 5, beyond=0.0)
@@ -63,9 +63,7 @@ def test_words_are_read_again_after_an_edit(tmp_path: Path) -> None:
             assert [obj.name for obj in felt.objects] == ["floor"]
 
 
-def test_a_lost_connection_is_survived_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_batch_tool_reconnects_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with make(tmp_path) as env:
         scatter(env)
         shell, poses = cloud(100), poses_in(env.grid, 50)
@@ -86,7 +84,7 @@ def test_a_lost_connection_is_survived_once(
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
-def test_a_batch_that_was_interrupted_can_be_asked_again(tmp_path: Path, jobs: int) -> None:
+def test_batch_tool_usable_after_interrupt(tmp_path: Path, jobs: int) -> None:
     with make(tmp_path) as env:
         scatter(env)
         shell, poses = cloud(100), poses_in(env.grid, 50)

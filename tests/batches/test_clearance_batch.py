@@ -62,7 +62,7 @@ def assert_is_right(
 
 @given(st.integers(0, 10_000), st.sampled_from([0.7, 5.0, 40.0]))
 @settings(max_examples=6)
-def test_clearance_is_that_of_brute_force(
+def test_clearance_batch_equals_brute_force(
     tmp_path_factory: pytest.TempPathFactory, seed: int, reach: float
 ) -> None:
     """In each layout and curve, in and outside the grid, for tools of any size."""
@@ -76,7 +76,7 @@ def test_clearance_is_that_of_brute_force(
 
 
 @pytest.mark.parametrize("n_points", [70, 1000, 8000])
-def test_what_is_known_of_cubes_changes_no_distance(
+def test_clearance_batch_independent_of_cube_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_points: int
 ) -> None:
     """Dense and sparse shells along a curve, asked again, with a table of any size."""
@@ -96,7 +96,7 @@ def test_what_is_known_of_cubes_changes_no_distance(
                     assert found == pytest.approx(within, abs=ROUNDING)
 
 
-def test_many_threads_and_little_memory_find_the_same_distances(
+def test_clearance_batch_threads_same_distances(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The cells within reach of all poses do not fit into the table together."""
@@ -120,7 +120,7 @@ def test_many_threads_and_little_memory_find_the_same_distances(
             assert told[-1] == (40, 40)
 
 
-def test_the_clearance_of_a_point_above_a_floor_is_its_height(tmp_path: Path) -> None:
+def test_clearance_batch_point_above_floor(tmp_path: Path) -> None:
     with make(tmp_path, 7) as env:
         write_voxels(env.store, block((0, 0, 0), (127, 127, 63)), "floor")  # its top is z = 0
         shell = PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3))
@@ -135,7 +135,7 @@ def test_the_clearance_of_a_point_above_a_floor_is_its_height(tmp_path: Path) ->
         assert env.clearance(shell, poses, 0.04).distances.tolist() == [np.inf] * 6
 
 
-def test_a_reach_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_clearance_batch_bad_reach(tmp_path: Path) -> None:
     with make(tmp_path, 10) as env:
         poses = poses_in(env.grid, 2)
         assert env.clearance(cloud(50), poses).distances.tolist() == [np.inf] * 2  # empty
@@ -150,7 +150,7 @@ def test_a_reach_that_is_none_is_refused(tmp_path: Path) -> None:
             batch_tool.clearance(poses, 400 * SIZE)
 
 
-def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
+def test_clearance_exact_boxes(tmp_path: Path) -> None:
     """Of surfaces, whatever the voxels: two boxes, and a box at poses around them."""
     rng = np.random.default_rng(2)
     halves = np.array([[0.05, 0.02, 0.03], [0.01, 0.06, 0.02]])
@@ -202,9 +202,7 @@ def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
     assert np.linalg.norm(between.on_a - between.on_b) == pytest.approx(between.at_most)
 
 
-def test_the_least_distance_of_parts_with_chord_errors_has_both_bounds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_clearance_chord_error_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cubes of 0.1 m, 0.2 and 0.35 m from the first one, each with a chord error of 0.05 m.
 
     The third one's AABB is beyond the upper bound, so its surface is not read.

@@ -12,7 +12,7 @@ from sources import ROOT
 MAIN = runpy.run_path(str(ROOT / "examples" / "learn_contacts.py"))["main"]
 
 
-def test_a_data_set_says_what_is_touched_and_can_be_made_again(tmp_path: Path) -> None:
+def test_learn_contacts_reproducible_data_set(tmp_path: Path) -> None:
     url, (first, again) = str(tmp_path / "s.db"), (tmp_path / f"{n}.npz" for n in "ab")
     grid = hapticdb.GridOptions(bits=6)
     hapticdb.import_files(

@@ -37,7 +37,7 @@ def simulated() -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("check", CHECKS)
-def test_the_simulator_feels_as_the_processor(simulated: str, check: str) -> None:
+def test_gpu_simulator_equals_cpu(simulated: str, check: str) -> None:
     assert check in simulated.splitlines(), simulated
 
 
@@ -55,7 +55,7 @@ print(*found.distances, *found.points)
 """
 
 
-def test_the_simulator_finds_the_nearest_voxels(env: Environment) -> None:
+def test_gpu_simulator_nearest_voxels(env: Environment) -> None:
     """As plain Python: the search counts bits by instructions that the simulator does not have."""
     write_voxels(env.store, block((20, 24, 28), (27, 30, 31)), "block")
     shell, poses = cloud(5), poses_in(env.grid, 6, beyond=0.0)
@@ -74,7 +74,7 @@ def env(tmp_path: Path) -> Environment:
     return make(tmp_path, 6)
 
 
-def test_no_gpu_or_unknown_device_is_told(
+def test_batch_tool_no_gpu_or_unknown_device(
     env: Environment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: False)

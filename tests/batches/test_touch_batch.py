@@ -37,7 +37,9 @@ def assert_equals_touches(
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=6)
-def test_a_batch_equals_single_touches(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_touch_batch_equals_single_touches(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
     """In each layout and curve, in and outside the grid, for tools of any size."""
     rng = np.random.default_rng(seed)
     layout, curve = HIERARCHICAL[seed % 4]
@@ -52,7 +54,7 @@ def test_a_batch_equals_single_touches(tmp_path_factory: pytest.TempPathFactory,
             assert collides.tolist() == (felt.hits > 0).tolist()
 
 
-def test_a_batch_equals_single_touches_under_the_law_distance(tmp_path: Path) -> None:
+def test_touch_batch_distance_law_equals_single_touches(tmp_path: Path) -> None:
     with create_environment(tmp_path / "s.db", Grid(0.002, (-0.06,) * 3, 6)) as env:
         sheet = np.argwhere(np.ones((40, 40))) / 3.0 - 7.0
         for axis in range(2):
@@ -68,9 +70,7 @@ def test_a_batch_equals_single_touches_under_the_law_distance(tmp_path: Path) ->
             assert batch_tool.collides(poses).tolist() == (felt.hits > 0).tolist()
 
 
-def test_many_threads_and_little_memory_change_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_touch_batch_threads_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """512 cells, nearly all with voxels, in a table with fewer slots; poses in random order."""
     monkeypatch.setattr(batch_threads, "CHUNK_POSES", 3)
     with make(tmp_path, 8) as env:
@@ -99,7 +99,7 @@ def test_many_threads_and_little_memory_change_nothing(
         assert (plenty.forces[7] + 0.0).tobytes() == (touch.force + 0.0).tobytes()
 
 
-def test_the_objects_of_a_batch_are_those_of_its_poses(tmp_path: Path) -> None:
+def test_touch_batch_objects_by_pose(tmp_path: Path) -> None:
     with make(tmp_path, 6) as env:
         write_voxels(env.store, block((0, 0, 0), (63, 63, 3)), "floor")
         write_voxels(env.store, block((0, 0, 60), (63, 63, 63)), "lid")
@@ -118,7 +118,7 @@ def test_the_objects_of_a_batch_are_those_of_its_poses(tmp_path: Path) -> None:
             _ = env.touch(shell, poses=poses).ids
 
 
-def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
+def test_touch_batch_bad_input(tmp_path: Path) -> None:
     with make(tmp_path, 6) as env:
         scatter(env)
         shell, poses = cloud(5), poses_in(env.grid, 4)

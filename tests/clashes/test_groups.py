@@ -35,7 +35,7 @@ def made(path: Path, boxes: Mapping[str, tuple[float, ...]]) -> Environment:
     return env
 
 
-def test_copies_of_a_pair_are_one_finding_wherever_they_are(tmp_path: Path) -> None:
+def test_groups_of_copies_of_a_pair_share_a_group(tmp_path: Path) -> None:
     with hapticdb.open(row_of_boxes(tmp_path / "row.db", 4, 0.098)) as env:
         (group,) = grouped(env)
         assert (group.kind, len(group.pairs), group.n_parts) == ("overlapping", 3, 4)
@@ -50,7 +50,7 @@ def test_copies_of_a_pair_are_one_finding_wherever_they_are(tmp_path: Path) -> N
         assert (fewer.id, len(fewer.pairs)) == (group.id, 2)
 
 
-def test_the_id_of_a_pair_stays_where_lengths_are_halves_of_the_step(tmp_path: Path) -> None:
+def test_groups_of_id_stable_at_rounding_ties(tmp_path: Path) -> None:
     inch = 0.0254  # a sixteenth: 1587.5 times the step
     place = (0.09, inch / 16, 3 * inch / 16)
     boxes = {"a": (0.1, 0.1, 0.1, 0.0, 0.0, 0.0), "b": (0.1, 0.05, 0.07, *place)}
@@ -65,7 +65,7 @@ def test_the_id_of_a_pair_stays_where_lengths_are_halves_of_the_step(tmp_path: P
 
 
 @pytest.mark.parametrize("scale", [(1.0, 2.0, 0.5), (-1.0, 1.0, 1.0), (-2.0, 1.5, 1.0)])
-def test_the_id_of_a_stretched_pair_stays_where_it_is_turned(
+def test_groups_of_id_stable_under_rotation_of_scaled_pair(
     tmp_path: Path, scale: tuple[float, float, float]
 ) -> None:
     boxes = {"a": (0.1, 0.1, 0.1, 0.0, 0.0, 0.0), "b": (0.1, 0.05, 0.07, 0.05, 0.01, 0.02)}
@@ -81,7 +81,7 @@ def test_the_id_of_a_stretched_pair_stays_where_it_is_turned(
         assert group.id not in {one.id for one in grouped(env)}
 
 
-def test_groups_are_the_same_in_any_order_of_import(tmp_path: Path) -> None:
+def test_groups_of_independent_of_import_order(tmp_path: Path) -> None:
     boxes: dict[str, tuple[float, ...]] = {}
     for n in range(3):
         boxes[f"bar{n}"] = (0.02, 0.02, 0.5 + 0.01 * n, 0.15 * n, 0.0, 0.0)
@@ -95,7 +95,7 @@ def test_groups_are_the_same_in_any_order_of_import(tmp_path: Path) -> None:
     assert one == same
 
 
-def test_a_new_member_opens_an_accepted_group(tmp_path: Path) -> None:
+def test_groups_of_new_member_reopens_accepted_group(tmp_path: Path) -> None:
     with hapticdb.open(row_of_boxes(tmp_path / "row.db", 5, 0.098)) as env:
         there = env.object(5).transform
         env.shift([5], (0.5, 0.0, 0.0))
@@ -108,7 +108,7 @@ def test_a_new_member_opens_an_accepted_group(tmp_path: Path) -> None:
         assert (again.id, again.is_open, again.status()) == (group.id, True, "3 of 4 accepted")
 
 
-def test_one_part_against_many_is_one_finding(tmp_path: Path) -> None:
+def test_groups_of_one_part_against_many(tmp_path: Path) -> None:
     pins = {f"pin{n}": (0.02, 0.02, 0.1 + 0.01 * n, 0.1 * n, 0.0, 0.0) for n in range(3)}
     boxes = {"plate": (1.0, 1.0, 0.01, 0.0, 0.0, 0.0), **pins}
     with made(tmp_path / "plate.db", boxes) as env:
@@ -125,7 +125,7 @@ def test_one_part_against_many_is_one_finding(tmp_path: Path) -> None:
         assert (more.id, len(more.pairs)) == (group.id, 4)
 
 
-def test_duplicates_are_one_finding_that_is_not_measured(place: Place, tmp_path: Path) -> None:
+def test_groups_of_duplicates_are_not_measured(place: Place, tmp_path: Path) -> None:
     boxes = {f"copy{n}": (0.1, 0.1, 0.1, 0.2, 0.3, 0.4) for n in range(12)}
     boxes |= {f"other{n}": (0.1, 0.1, 0.1, -0.2, 0.3, 0.4) for n in range(2)}
     with made(tmp_path / "dup.db", boxes) as env:
@@ -150,7 +150,7 @@ def test_duplicates_are_one_finding_that_is_not_measured(place: Place, tmp_path:
         assert row.kind != "duplicate"
 
 
-def test_duplicates_may_be_a_micrometre_apart_and_not_more(tmp_path: Path) -> None:
+def test_groups_of_duplicates_tolerance_is_a_micrometre(tmp_path: Path) -> None:
     boxes = {f"copy{n}": (0.1, 0.1, 0.1, 0.2, 0.3, 0.4) for n in range(5)}
     with made(tmp_path / "dup.db", boxes) as env:
         for n in range(1, 5):

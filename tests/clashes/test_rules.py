@@ -61,7 +61,7 @@ def reach(found: Clashes) -> list[tuple[int, int]]:
         ("'a and b: c' in d: overlap is meant", Rule("a and b: c", "d", "meant", MEANT)),
     ],
 )  # fmt: skip
-def test_parse_rule_reads_what_rule_text_writes(text: str, rule: Rule) -> None:
+def test_parse_rule_inverts_rule_text(text: str, rule: Rule) -> None:
     assert parse_rule(text) == rule
     assert parse_rule(rule_text(rule)) == rule._replace(because="")
 
@@ -81,7 +81,7 @@ def test_parse_rule_reads_what_rule_text_writes(text: str, rule: Rule) -> None:
         ("a in " + "b: c in " * 300 + "d", "2,406 characters"),
     ],
 )
-def test_parse_rule_refuses_others_in_one_line(text: str, word: str) -> None:
+def test_parse_rule_bad_text(text: str, word: str) -> None:
     with pytest.raises(UsageError, match=word) as refusal:
         parse_rule(text)
     assert "\n" not in str(refusal.value)
@@ -90,7 +90,7 @@ def test_parse_rule_refuses_others_in_one_line(text: str, word: str) -> None:
 @pytest.mark.parametrize(
     "name", ["12", "3,4", "a in b", "in b", "b and", "x:", "x: y", "it's", "[a]*", "a=b"]
 )
-def test_rule_for_reaches_the_pair(name: str) -> None:
+def test_rule_for_matches_its_pair(name: str) -> None:
     objects = [
         Object(other, "f", "d", np.eye(4), 1, np.zeros((2, 3)), {}, id=n)
         for n, other in enumerate((name, "other", "else"), start=10)
@@ -101,12 +101,12 @@ def test_rule_for_reaches_the_pair(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["'a'", "a\nb", "it's in b", "and b in c: ignore because it"])
-def test_rule_for_is_empty_where_no_rule_can_hold_a_name(name: str) -> None:
+def test_rule_for_empty_for_unquotable_names(name: str) -> None:
     one = Clash(1, 2, name, "'b' in c", Kind.TOUCHING, 0.0, 0.0, (0.0,) * 6, "new")
     assert rule_for(one) == ""
 
 
-def test_read_rules_keeps_the_order_of_a_file(tmp_path: Path) -> None:
+def test_read_rules_order_of_file(tmp_path: Path) -> None:
     file = tmp_path / "rules.toml"
     file.write_text("""
         rules = [
@@ -138,7 +138,7 @@ def test_read_rules_keeps_the_order_of_a_file(tmp_path: Path) -> None:
         ("rules = ['a in b: fits is meant']", "rule 1: 'fits'"),
     ],
 )
-def test_read_rules_names_the_file_and_the_rule(tmp_path: Path, content: str, words: str) -> None:
+def test_read_rules_error_names_file_and_rule(tmp_path: Path, content: str, words: str) -> None:
     file = tmp_path / "rules.toml"
     file.write_text(content)
     with pytest.raises((UsageError, FileError)) as refusal:
@@ -148,12 +148,12 @@ def test_read_rules_names_the_file_and_the_rule(tmp_path: Path, content: str, wo
     assert "\n" not in str(refusal.value)
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_read_rules_missing_file(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"none\.toml"):
         read_rules(tmp_path / "none.toml")
 
 
-def test_a_meant_overlap_is_no_finding_up_to_its_depth(place: Place, path: Path) -> None:
+def test_rules_meant_overlap_up_to_depth(place: Place, path: Path) -> None:
     url = place()
     copy_environment(path, url)
     for where in (str(path), url):
@@ -176,7 +176,7 @@ def test_a_meant_overlap_is_no_finding_up_to_its_depth(place: Place, path: Path)
             assert len(decided(env).of()) == 2
 
 
-def test_the_first_rule_that_reaches_a_pair_decides(path: Path) -> None:
+def test_rules_first_match_decides(path: Path) -> None:
     with hapticdb.open(path) as env:
         deep, shallow = (f"* in *: overlap up to {depth} mm is meant" for depth in (3, 1))
         assert decided(env, deep, shallow).of() == ()
@@ -185,7 +185,7 @@ def test_the_first_rule_that_reaches_a_pair_decides(path: Path) -> None:
         assert [bool(one.missing) for one in found.reach()] == [False, False, True]
 
 
-def test_objects_that_are_too_near_are_findings(path: Path) -> None:
+def test_rules_pairs_below_clearance_are_findings(path: Path) -> None:
     with hapticdb.open(path) as env:
         with pytest.raises(UsageError, match=r"rule 1 .* within 1 mm .* --within 2mm"):
             decided(env, "cables/* and *: keep 2 mm apart")
@@ -199,7 +199,7 @@ def test_objects_that_are_too_near_are_findings(path: Path) -> None:
         assert [row.kind for row in env.store.pairs()][-1] == "apart"
 
 
-def test_an_ignored_pair_is_not_measured_until_the_rule_goes(path: Path) -> None:
+def test_rules_ignored_pair_is_not_measured(path: Path) -> None:
     with hapticdb.open(path) as env:
         found = decided(env, "plates/* and *: ignore")
         assert (found.measured, found.ignored, set(told(found))) == (1, ((1, 2), (2, 3)), {(3, 4)})
@@ -218,7 +218,7 @@ def test_an_ignored_pair_is_not_measured_until_the_rule_goes(path: Path) -> None
         assert find_clashes(env).measured == 0
 
 
-def test_add_rules_keeps_each_once_and_none_with_too_great_a_clearance(path: Path) -> None:
+def test_add_rules_no_duplicates_and_clearance_limit(path: Path) -> None:
     ignore, apart = "bolts/* and *: ignore", "plates/* and *: keep 2 mm apart"
     with hapticdb.open(path) as env:
         for texts in ([ignore], [ignore, apart], [apart]):
@@ -229,7 +229,7 @@ def test_add_rules_keeps_each_once_and_none_with_too_great_a_clearance(path: Pat
         assert len(env.store.rules()) == 2
 
 
-def test_rules_are_copied_into_an_environment_without_some(tmp_path: Path, path: Path) -> None:
+def test_copy_environment_copies_rules(tmp_path: Path, path: Path) -> None:
     rule = parse_rule("plates/* and *: ignore")
     with hapticdb.open(path) as env:
         env.store.change_rules(lambda _: [rule])

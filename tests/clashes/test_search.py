@@ -51,7 +51,7 @@ def told(found: Clashes) -> set[tuple[int, int, str, str]]:
     return {(one.a, one.b, one.kind, one.status) for one in found.pairs}
 
 
-def test_each_call_says_what_is_new_since_the_last(path: Path) -> None:
+def test_find_clashes_status_since_last_call(path: Path) -> None:
     with hapticdb.open(path) as env:
         first = find_clashes(env)
         assert told(first) == {(n, n + 1, "touching", "new") for n in (1, 2, 3)}
@@ -74,7 +74,7 @@ def test_each_call_says_what_is_new_since_the_last(path: Path) -> None:
         assert {(one.a_name, one.b_name) for one in gone} == {(None, "cube1")}
 
 
-def test_words_choose_one_of_each_pair_and_leave_the_others(path: Path) -> None:
+def test_find_clashes_of_and_against(path: Path) -> None:
     with hapticdb.open(path) as env:
         assert {one[:2] for one in find_clashes(env, of=["cube0"]).pairs} == {(1, 2)}
         assert find_clashes(env, of=["cube1"], against=["cube1"]).pairs == ()
@@ -86,7 +86,7 @@ def test_words_choose_one_of_each_pair_and_leave_the_others(path: Path) -> None:
         assert told(found) == {(2, 3, "touching", "same")}
 
 
-def test_another_tolerance_measures_anew(path: Path) -> None:
+def test_find_clashes_new_tolerance_measures_again(path: Path) -> None:
     with hapticdb.open(path) as env:
         shifted(env, 1, 0.2 * MM)
         assert [one.kind for one in find_clashes(env, of=[1]).pairs] == ["overlapping"]
@@ -95,7 +95,7 @@ def test_another_tolerance_measures_anew(path: Path) -> None:
         assert wider.measured == 1
 
 
-def test_an_accepted_pair_stays_so_until_a_shape_changes(path: Path) -> None:
+def test_accept_clash_until_shape_changes(path: Path) -> None:
     with hapticdb.open(path) as env:
         with pytest.raises(UsageError, match="run 'hapticdb clashes'"):
             accept_clash(env, [1], [2], "a press fit")
@@ -119,7 +119,7 @@ def test_an_accepted_pair_stays_so_until_a_shape_changes(path: Path) -> None:
             accept_clash(env, [1], [2], " ")
 
 
-def test_a_reader_finds_the_same_and_keeps_nothing(path: Path) -> None:
+def test_find_clashes_read_only_stores_nothing(path: Path) -> None:
     with hapticdb.open(path) as env, hapticdb.open(path, read_only=True) as reader:
         found = find_clashes(reader)
         assert not found.is_kept
@@ -130,7 +130,7 @@ def test_a_reader_finds_the_same_and_keeps_nothing(path: Path) -> None:
 
 @pytest.mark.parametrize(("within", "contact", "seconds"), [(0.0, 1e-5, 1), (1e-5, 1e-3, 1),
     (np.inf, 1e-5, 1), (1e-3, np.nan, 1), (1e-3, 1e-5, 0.0)])  # fmt: skip
-def test_numbers_that_cannot_be_are_refused(
+def test_find_clashes_bad_numbers(
     path: Path, within: float, contact: float, seconds: float
 ) -> None:
     with hapticdb.open(path) as env, pytest.raises(UsageError):
@@ -145,7 +145,7 @@ def findings(env: Environment) -> Found:
     return [(*row[:6], row.status) for row in env.store.pairs()]
 
 
-def test_a_stopped_search_goes_on_and_says_all_that_is_new(path: Path) -> None:
+def test_find_clashes_resumes_after_interrupt(path: Path) -> None:
     def stop(done: int, _: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
@@ -159,7 +159,7 @@ def test_a_stopped_search_goes_on_and_says_all_that_is_new(path: Path) -> None:
         assert {one.status for one in find_clashes(env).pairs} == {"same"}
 
 
-def test_threads_find_the_same_and_raise_what_a_pair_raises(
+def test_find_clashes_threads_same_pairs_and_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, found = row_of_boxes(tmp_path / "long.db", 9), []
@@ -189,7 +189,7 @@ def test_threads_find_the_same_and_raise_what_a_pair_raises(
         assert 0 < len(list(env.store.pairs())) < 8
 
 
-def test_what_the_time_leaves_is_told_as_not_looked_at(path: Path) -> None:
+def test_find_clashes_time_limit_leaves_pairs_unknown(path: Path) -> None:
     with hapticdb.open(path) as env:
         found = find_clashes(env, seconds=1e-9)
         assert found.left == 3
@@ -216,7 +216,7 @@ def random_edit(env: Environment, rng: np.random.Generator, removed: list[haptic
 @pytest.mark.parametrize(
     ("n_edits", "n_queries"), [(60, 6), pytest.param(1000, 50, marks=pytest.mark.long)]
 )
-def test_the_kept_table_is_bit_for_bit_that_of_a_full_run(
+def test_find_clashes_incremental_equals_full_run(
     tmp_path: Path, n_edits: int, n_queries: int
 ) -> None:
     path, rng = row_of_boxes(tmp_path / "e.db", 20), np.random.default_rng(n_edits)
@@ -240,7 +240,9 @@ def full_findings(env: Environment) -> Found:
     return [row[:6] for row in findings(env)]
 
 
-def test_only_what_is_near_a_change_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_find_clashes_reads_only_changed_neighbourhood(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with hapticdb.open(path) as env:
         first = find_clashes(env)
         read: list[set[int]] = []
@@ -260,7 +262,7 @@ def test_only_what_is_near_a_change_is_read(path: Path, monkeypatch: pytest.Monk
         assert [one[:4] for one in found.pairs] == [one[:4] for one in first.pairs]
 
 
-def test_what_another_writes_meanwhile_is_looked_at(path: Path) -> None:
+def test_find_clashes_concurrent_edit_is_measured(path: Path) -> None:
     with hapticdb.open(path) as env, hapticdb.open(path) as other:
         late = PairRow(1, 4, Kind.TOUCHING, 0.0, 0.0, (0.0,) * 6, "same", 1, "of an older scene")
         find_clashes(env, progress=lambda *_: other.store.put_pairs([late]) and None)
@@ -280,7 +282,7 @@ def test_what_another_writes_meanwhile_is_looked_at(path: Path) -> None:
         "UPDATE pair SET kind = 'far', setting = 'of an older program' WHERE (a, b) = (2, 3)",
     ],
 )
-def test_what_knows_of_no_mark_may_write(path: Path, statement: str) -> None:
+def test_find_clashes_repairs_rows_of_foreign_writers(path: Path, statement: str) -> None:
     with hapticdb.open(path) as env:
         find_clashes(env)
     with closing(sqlite3.connect(path)) as connection, connection:
@@ -296,7 +298,7 @@ def on_server(place: Place, path: Path) -> str:
     return url
 
 
-def test_two_at_once_make_one_table(place: Place, path: Path) -> None:
+def test_find_clashes_two_concurrent_searches(place: Place, path: Path) -> None:
     url = on_server(place, path)
     errors: list[BaseException] = []
 
@@ -322,7 +324,7 @@ def test_two_at_once_make_one_table(place: Place, path: Path) -> None:
 PAGE = Path(hapticdb.__file__).parents[2] / "docs" / "clashes.md"
 
 
-def test_the_questions_of_the_page_are_answered_on_each_engine(place: Place, path: Path) -> None:
+def test_docs_pair_queries_same_on_each_engine(place: Place, path: Path) -> None:
     with hapticdb.open(path) as env:
         find_clashes(env)
         accept_clash(env, [1], [2], "meant so")
@@ -356,7 +358,7 @@ with hapticdb.open(sys.argv[1]) as env:
 """
 
 
-def test_what_was_found_before_a_kill_is_there(place: Place, path: Path) -> None:
+def test_find_clashes_after_sigkill_continues(place: Place, path: Path) -> None:
     url = on_server(place, path)
     assert finished([sys.executable, "-c", KILLED, url]).returncode == -signal.SIGKILL
     with hapticdb.open(url) as env, hapticdb.open(path) as alone:
@@ -367,7 +369,7 @@ def test_what_was_found_before_a_kill_is_there(place: Place, path: Path) -> None
         assert findings(env) == findings(alone)
 
 
-def test_a_viewer_reads_and_an_editor_keeps(
+def test_find_clashes_roles_viewer_and_editor(
     place: Place, path: Path, admin: psycopg.Connection
 ) -> None:
     url = on_server(place, path)

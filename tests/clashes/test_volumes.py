@@ -46,7 +46,7 @@ def test_with_volumes_two_cubes(tmp_path: Path) -> None:
     assert one.length_text().endswith(", 24 cm³")
 
 
-def test_with_volumes_placements_turned_scaled_mirrored_and_far_away(tmp_path: Path) -> None:
+def test_with_volumes_transformed_parts(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))
     move = np.eye(4) + translation(FAR)
@@ -65,7 +65,7 @@ def test_with_volumes_any_winding_and_torn_edges(tmp_path: Path) -> None:
     assert one.volume == pytest.approx(0.04 * 0.03 * 0.02, rel=1e-5)
 
 
-def test_with_volumes_caps_of_balls(tmp_path: Path) -> None:
+def test_with_volumes_spherical_caps(tmp_path: Path) -> None:
     radius, apart = 0.05, 0.08
     one = trimesh.creation.icosphere(subdivisions=4, radius=radius)
     other = one.copy()
@@ -81,7 +81,7 @@ def test_with_volumes_caps_of_balls(tmp_path: Path) -> None:
     assert lens(radius - chord) < pair.volume < lens(radius)
 
 
-def test_with_volumes_open_surfaces_are_not_known_and_stay(tmp_path: Path) -> None:
+def test_with_volumes_open_surfaces_unknown(tmp_path: Path) -> None:
     sheet = box(0.1, (0.06, 0.07, 0.08))
     sheet.update_faces(np.arange(12) > 0)
     (one,) = searched(tmp_path, box(0.1, (0, 0, 0)), sheet, least=1.0).pairs
@@ -90,7 +90,7 @@ def test_with_volumes_open_surfaces_are_not_known_and_stay(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("least", "n"), [(2e-5, 2), (3e-5, 1)])
-def test_with_volumes_a_floor(tmp_path: Path, least: float, n: int) -> None:
+def test_with_volumes_least_volume(tmp_path: Path, least: float, n: int) -> None:
     boxes = box(0.1, (0, 0, 0)), box(0.1, (0.06, 0.07, 0.08)), box(0.1, (0, 0, -0.1))
     found = searched(tmp_path, *boxes, least=least)
     assert len(found.pairs) == n
@@ -99,7 +99,7 @@ def test_with_volumes_a_floor(tmp_path: Path, least: float, n: int) -> None:
     assert len(found.of()) == n - 1
 
 
-def test_with_volumes_a_missing_extra_and_a_floor_below_0(
+def test_with_volumes_bad_limit_and_missing_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(UsageError, match="least volume"):

@@ -24,7 +24,7 @@ def mapped(scene: Path) -> Path:
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".parquet"])
-def test_a_batch_is_written_to_the_last_bit(
+def test_touch_out_equals_batch_bits(
     run: Run, mapped: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
     monkeypatch.setattr(batch_tool, "PIECE", 3)
@@ -57,9 +57,7 @@ def test_a_batch_is_written_to_the_last_bit(
     assert not list(mapped.parent.glob(".*"))
 
 
-def test_what_does_not_fit_is_told_in_a_line(
-    run: Run, mapped: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_touch_out_bad_input(run: Run, mapped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     np.save(mapped.with_name("flat.npy"), np.eye(4))
     mapped.with_name("text.npy").write_text("no array")

@@ -30,7 +30,7 @@ def meeting(scene: Path) -> Path:
     return scene
 
 
-def test_the_gravest_come_first_and_the_second_call_says_same(run: Run, meeting: Path) -> None:
+def test_clashes_order_by_severity_then_same(run: Run, meeting: Path) -> None:
     code, out, _ = run("clashes", meeting, "--json")
     first, second = (json.loads(line) for line in out.splitlines())
     assert code == 1
@@ -44,7 +44,7 @@ def test_the_gravest_come_first_and_the_second_call_says_same(run: Run, meeting:
     assert "0 pairs, 2 known before" in out
 
 
-def test_an_accepted_pair_gives_exit_code_0(run: Run, meeting: Path) -> None:
+def test_clashes_accepted_pair_exit_code(run: Run, meeting: Path) -> None:
     assert run("clashes", meeting, "--of", "box2")[0] == 0
     assert run("clashes", meeting)[0] == 1
     code, out, _ = run("clashes", meeting, "--accept", "box0", "2", "--because", "a press fit")
@@ -61,14 +61,14 @@ def test_an_accepted_pair_gives_exit_code_0(run: Run, meeting: Path) -> None:
     assert line.split()[-2:] == ["-", "gone"]
 
 
-def test_rows_are_written_as_csv(run: Run, meeting: Path, tmp_path: Path) -> None:
+def test_clashes_csv_columns(run: Run, meeting: Path, tmp_path: Path) -> None:
     assert run("clashes", meeting, "--csv", tmp_path / "pairs.csv", "--kind", "touching")[0] == 1
     (row,) = csv.DictReader((tmp_path / "pairs.csv").open())
     assert list(row)[7:13] == [f"{of}_{axis}_m" for of in "ab" for axis in "xyz"]
     assert (row["a_name"], row["kind"], row["at_least_m"]) == ("box1", "touching", "0.0")
 
 
-def test_a_group_is_shown_and_accepted_by_its_id(run: Run, tmp_path: Path) -> None:
+def test_clashes_group_accepted_by_id(run: Run, tmp_path: Path) -> None:
     path = row_of_boxes(tmp_path / "row.db", 4, 0.098)
     code, out, _ = run("clashes", path)
     (line,) = (line for line in out.splitlines() if "and 2 alike" in line)
@@ -88,9 +88,7 @@ def test_a_group_is_shown_and_accepted_by_its_id(run: Run, tmp_path: Path) -> No
     refused(run("clashes", path, "--group", "none"), "--group 'none'")
 
 
-def test_rules_are_kept_and_what_they_reach_is_told(
-    run: Run, meeting: Path, tmp_path: Path
-) -> None:
+def test_clashes_rules_stored_and_reported(run: Run, meeting: Path, tmp_path: Path) -> None:
     meant = "box0 in *: overlap up to 11 mm is meant because a fit"
     code, out, _ = run("clashes", meeting, "--rule", meant)
     assert code == 0
@@ -116,7 +114,7 @@ def test_rules_are_kept_and_what_they_reach_is_told(
     assert "rule" not in run("clashes", meeting, "--rules", rules)[1]
 
 
-def test_duplicates_give_exit_code_1(run: Run, tmp_path: Path) -> None:
+def test_clashes_duplicates_exit_code(run: Run, tmp_path: Path) -> None:
     path = row_of_boxes(tmp_path / "row.db", 40, 0.0)
     code, out, _ = run("clashes", path)
     assert (code, "cube0, 40 at one place" in out, "780 duplicate" in out) == (1, True, True)
@@ -124,7 +122,7 @@ def test_duplicates_give_exit_code_1(run: Run, tmp_path: Path) -> None:
     assert run("clashes", path, "--kind", "inside")[0] == 0
 
 
-def test_a_buried_part_gives_exit_code_1(run: Run, tmp_path: Path) -> None:
+def test_clashes_enclosed_part_exit_code(run: Run, tmp_path: Path) -> None:
     parts = {"wall": box((0, 0, 0), (1, 1, 1)), "pipe": ball((0.5, 0.5, 0.5), 0.1)}
     coarse = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6))
     hapticdb.import_files(tmp_path / "a.db", [write_obj(tmp_path / "a.obj", parts)], coarse)
@@ -132,7 +130,7 @@ def test_a_buried_part_gives_exit_code_1(run: Run, tmp_path: Path) -> None:
     assert (code, "inside" in out) == (1, True)
 
 
-def test_a_page_needs_no_other_file_and_shows_names_as_they_are(run: Run, tmp_path: Path) -> None:
+def test_clashes_html_self_contained_and_escaped(run: Run, tmp_path: Path) -> None:
     name = "<script>alert('&')</script>"
     path = row_of_boxes(tmp_path / "row.db", 3, 0.099, names=("a/one", f"a/b/{name}", "a/b/two"))
     assert run("clashes", path, "--html", tmp_path / "meet.html")[0] == 1
@@ -150,13 +148,13 @@ def test_a_page_needs_no_other_file_and_shows_names_as_they_are(run: Run, tmp_pa
     refused(run("clashes", path, "--html", tmp_path / "meet.html"), "not there yet")
 
 
-def test_a_search_that_was_not_finished_gives_exit_code_3(run: Run, meeting: Path) -> None:
+def test_clashes_unfinished_exit_code(run: Run, meeting: Path) -> None:
     code, out, _ = run("clashes", meeting, "--seconds", "1e-9")
     assert code == 3
     assert "2 pairs: call again" in out
 
 
-def test_a_turn_and_a_path_say_when_parts_meet(run: Run, tmp_path: Path) -> None:
+def test_clashes_rotation_and_path_first_contact(run: Run, tmp_path: Path) -> None:
     path = row_of_boxes(tmp_path / "row.db", 2, 0.3)
     hinge = ("--of", "cube1", "--turn", "z", "--about", "150,0,0", "--from", "90", "--to", "270")
     code, out, _ = run("clashes", path, *hinge, "--json")
@@ -179,7 +177,7 @@ def test_a_turn_and_a_path_say_when_parts_meet(run: Run, tmp_path: Path) -> None
     refused(run("clashes", path, "--of", "cube0", "--turn", "w"), "--turn x, y or z")
 
 
-def test_what_cannot_be_is_refused_in_one_line(run: Run, meeting: Path) -> None:
+def test_clashes_bad_input(run: Run, meeting: Path) -> None:
     refused(run("clashes", meeting, "--kind", "near"), "--kind 'near'", "touching")
     refused(run("clashes", meeting, "--within", "0"), "give lengths above 0")
     refused(run("clashes", meeting, "--accept", "1", "2"), "--because")
@@ -190,9 +188,7 @@ def test_what_cannot_be_is_refused_in_one_line(run: Run, meeting: Path) -> None:
     refused(run("clashes", meeting, "--rules", "none.toml"), "none.toml")
 
 
-def test_files_are_refused_before_the_search_and_leave_nothing(
-    run: Run, meeting: Path, tmp_path: Path
-) -> None:
+def test_clashes_unwritable_report_leaves_no_file(run: Run, meeting: Path, tmp_path: Path) -> None:
     nowhere = ("--junit", tmp_path / "a.xml", "--bcf", tmp_path / "none" / "a.bcfzip")
     refused(run("clashes", meeting, *nowhere), "--bcf: cannot write", "No such file")
     assert "2 new" in run("clashes", meeting)[1]
@@ -208,7 +204,7 @@ def test_files_are_refused_before_the_search_and_leave_nothing(
     assert not [*tmp_path.rglob("*.xml"), *tmp_path.rglob("*.part")]
 
 
-def test_reports_are_of_one_revision_while_others_remove_objects(
+def test_clashes_reports_one_revision(
     run: Run, meeting: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def removing(*given: Any) -> bytes:  # noqa: ANN401 - passed on
@@ -222,7 +218,7 @@ def test_reports_are_of_one_revision_while_others_remove_objects(
     assert "2 gone" in run("clashes", meeting)[1]
 
 
-def test_accepting_needs_a_reason_and_takes_no_other_work(
+def test_clashes_accept_needs_reason_and_stands_alone(
     run: Run, meeting: Path, tmp_path: Path
 ) -> None:
     (group,) = {
@@ -237,7 +233,7 @@ def test_accepting_needs_a_reason_and_takes_no_other_work(
     assert run("clashes", meeting)[0] == 1
 
 
-def test_volumes_are_told_and_a_floor_decides(run: Run, meeting: Path, tmp_path: Path) -> None:
+def test_clashes_least_volume(run: Run, meeting: Path, tmp_path: Path) -> None:
     code, out, _ = run("clashes", meeting, "--least-volume", "99cm3", "--csv", tmp_path / "a.csv")
     assert code == 1
     assert "100 cm³" in out
@@ -250,7 +246,7 @@ def test_volumes_are_told_and_a_floor_decides(run: Run, meeting: Path, tmp_path:
     refused(run("clashes", meeting, "--least-volume", "1mm"), "no volume")
 
 
-def test_standard_output_has_the_result_while_a_terminal_shows_the_bar(meeting: Path) -> None:
+def test_clashes_bar_on_terminal_not_in_stdout(meeting: Path) -> None:
     shown = on_terminal("clashes", meeting, "--json", out=(out := io.StringIO()), code=1)
     assert "pairs" in shown
     kinds = [json.loads(line)["kind"] for line in out.getvalue().splitlines()]

@@ -23,7 +23,7 @@ HIDDEN = ("sample",)
 # -- help and verbs -------------------------------------------------------------------------------
 
 
-def test_alone_it_shows_the_verbs(run: Run) -> None:
+def test_main_without_arguments_lists_verbs(run: Run) -> None:
     out = succeeded(run())
     for verb in VERBS:
         assert re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
@@ -31,18 +31,18 @@ def test_alone_it_shows_the_verbs(run: Run) -> None:
         assert not re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
 
 
-def test_every_verb_has_help_with_an_example(run: Run) -> None:
+def test_main_help_example_for_each_verb(run: Run) -> None:
     for verb in (*VERBS, *HIDDEN):
         out = succeeded(run(verb, "--help"))
         assert max(map(len, out.splitlines())) <= 80
         assert f"Example: hapticdb {verb}" in " ".join(out.split())
 
 
-def test_version(run: Run) -> None:
+def test_main_version(run: Run) -> None:
     assert run("--version") == (0, f"hapticdb {hapticdb.__version__}\n", "")
 
 
-def test_every_verb_with_a_result_has_json() -> None:
+def test_main_json_option_of_each_verb() -> None:
     commands = cli.app.registered_commands
     assert {getattr(one.callback, "__wrapped__", None) for one in commands} == set(cli.VERBS)
     without = [v.__name__ for v in cli.VERBS if "output" not in inspect.signature(v).parameters]
@@ -58,20 +58,18 @@ def test_every_verb_with_a_result_has_json() -> None:
         ("import a.db b.glb --bits x", "--bits"), ("import a.db b.glb --unit yard", "--unit"),
     ],
 )  # fmt: skip
-def test_a_wrong_command_line_is_one_line_that_names_the_help(
-    run: Run, args: str, word: str
-) -> None:
+def test_main_bad_command_line(run: Run, args: str, word: str) -> None:
     refused(run(*args.split()), word, "--help")
 
 
-def test_debug_shows_where_an_error_came_from(run: Run) -> None:
+def test_main_debug_traceback(run: Run) -> None:
     code, _, err = run("--debug", "info", "none.db")
     assert code == 2
     assert "Traceback" in err
     assert err.splitlines()[-1].startswith("hapticdb: no environment at none.db")
 
 
-def test_an_unforeseen_error_is_one_line_too(
+def test_main_unexpected_error_one_line(
     run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object, **__: object) -> None:
@@ -100,14 +98,14 @@ for args, others in (
 """
 
 
-def test_what_answers_at_once_loads_nothing_that_is_slow(scene: Path) -> None:
+def test_main_lazy_imports(scene: Path) -> None:
     finished([sys.executable, "-c", LOADS, str(scene)], check=True)
 
 
 # -- import ---------------------------------------------------------------------------------------
 
 
-def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
+def test_import_json_line_per_file(run: Run, tmp_path: Path) -> None:
     file = boxes(tmp_path / "boxes.glb")
     code, out, err = run("import", "a.db", file, "none.stl", "--json", "--bits", 5)
     assert code == 2
@@ -119,9 +117,7 @@ def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
     assert "none.stl" in err
 
 
-def test_an_import_says_what_went_in_with_its_chord_error_and_defects(
-    run: Run, tmp_path: Path
-) -> None:
+def test_import_reports_chord_error_and_defects(run: Run, tmp_path: Path) -> None:
     file, small = step_files.cylinder(tmp_path / "a.step", 5, 10), ("--bits", 4)
     out = succeeded(run("import", "a.db", file, *small, "--chord", "0.1"))
     (chord,) = re.findall(r"chord error of its triangles: (\S+) µm", out)
@@ -138,13 +134,13 @@ def test_an_import_says_what_went_in_with_its_chord_error_and_defects(
         assert words in out
 
 
-def test_the_environment_and_the_file_of_an_import_may_be_swapped(run: Run, tmp_path: Path) -> None:
+def test_import_swapped_arguments(run: Run, tmp_path: Path) -> None:
     file = boxes(tmp_path / "boxes.glb")
     refused(run("import", "boxes.glb", "a.db"), "the environment is first: a.db boxes.glb")
     refused(run("import", file, tmp_path / "tool.stl"), "the environment is first")
 
 
-def test_voxels_that_are_no_good_size_are_noted(run: Run, tmp_path: Path) -> None:
+def test_import_unsuitable_voxel_size_note(run: Run, tmp_path: Path) -> None:
     far = boxes(tmp_path / "far.glb", count=1, side=3000.0)
     hint = "voxels of 75 m are coarse: --bits 14 makes them 0.293 m"
     assert hint in run("import", "a.db", far, "--bits", 6)[2]
@@ -152,7 +148,7 @@ def test_voxels_that_are_no_good_size_are_noted(run: Run, tmp_path: Path) -> Non
     assert "is --unit right?" in run("import", "b.db", tiny, "--bits", 6)[2]
 
 
-def test_a_negative_origin_is_read(run: Run, tmp_path: Path) -> None:
+def test_import_negative_origin(run: Run, tmp_path: Path) -> None:
     form = ("--origin", "-1,-2,-0.5", "--voxel-size", 0.05, "--bits", 7)
     succeeded(run("import", "a.db", boxes(tmp_path / "boxes.glb"), *form))
     assert json.loads(run("info", "a.db", "--json")[1])["origin"] == [-1, -2, -0.5]
@@ -166,14 +162,12 @@ def test_a_negative_origin_is_read(run: Run, tmp_path: Path) -> None:
         ("--origin 1,2,nan", "--origin"), ("--jobs 0", "jobs"),
     ],
 )  # fmt: skip
-def test_options_that_cannot_be_are_refused(
-    run: Run, tmp_path: Path, options: str, word: str
-) -> None:
+def test_import_bad_options(run: Run, tmp_path: Path, options: str, word: str) -> None:
     refused(run("import", "a.db", boxes(tmp_path / "boxes.glb"), *options.split()), word)
     assert not (tmp_path / "a.db").exists()
 
 
-def test_a_missing_environment_is_named(run: Run) -> None:
+def test_main_missing_environment(run: Run) -> None:
     for verb in (("info",), ("objects",), ("info", "--calibrate")):
         refused(run(*verb, "none.db"), "no environment at none.db", "hapticdb import")
 
@@ -181,7 +175,7 @@ def test_a_missing_environment_is_named(run: Run) -> None:
 # -- as a process ---------------------------------------------------------------------------------
 
 
-def test_a_reader_that_stops_early_is_no_error(scene: Path, tmp_path: Path) -> None:
+def test_touch_broken_pipe(scene: Path, tmp_path: Path) -> None:
     poses(tmp_path / "long.csv", *[(0.0, 0.0, 0.055)] * 2000)
     args = command("touch", scene, "--tool", "tool.npz", "--poses", "long.csv", "--json")
     with child(args, cwd=tmp_path) as process:
@@ -192,7 +186,7 @@ def test_a_reader_that_stops_early_is_no_error(scene: Path, tmp_path: Path) -> N
         assert process.stderr.read() == ""
 
 
-def test_names_beyond_the_terminals_encoding_are_printed(run: Run, tmp_path: Path) -> None:
+def test_objects_names_beyond_terminal_encoding(run: Run, tmp_path: Path) -> None:
     (tmp_path / "ä.obj").write_text("o é\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "utf-8")
     succeeded(run("import", "ä.db", "ä.obj", "--bits", 4))
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}

@@ -17,7 +17,7 @@ from voxels import write_voxels
 # -- copy -----------------------------------------------------------------------------------------
 
 
-def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path) -> None:
+def test_copy_reports_and_equals_source(run: Run, scene: Path) -> None:
     code, out, err = run("copy", scene, "b.db", "--layout", "voxel", "--curve", "hilbert")
     assert code == 0
     assert err == ("hapticdb: the layout voxel has no distances: it has the law plane alone\n")
@@ -32,7 +32,7 @@ def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path)
     )
 
 
-def test_copy_json_counts_objects(run: Run, scene: Path) -> None:
+def test_copy_json_counts(run: Run, scene: Path) -> None:
     found = json.loads(succeeded(run("copy", scene, "b.db", "--json")))
     assert (found["copied"], found["present"], found["renumbered"]) == (3, 0, 0)
 
@@ -40,7 +40,7 @@ def test_copy_json_counts_objects(run: Run, scene: Path) -> None:
 # -- diff -----------------------------------------------------------------------------------------
 
 
-def test_differences_are_told_a_line_each(run: Run, scene: Path) -> None:
+def test_diff_line_per_difference(run: Run, scene: Path) -> None:
     assert run("copy", scene, "b.db", "--layout", "voxel")[0] == 0
     assert run("diff", scene, "b.db")[0] == 0
     assert run("move", "b.db", 2, "--translate", "0,0,0.01")[0] == 0
@@ -66,7 +66,7 @@ def test_differences_are_told_a_line_each(run: Run, scene: Path) -> None:
     assert record["farthest_corner"] == pytest.approx(0.01)
 
 
-def test_many_differences_are_cut_and_counted(run: Run, scene: Path) -> None:
+def test_diff_truncated_and_counted(run: Run, scene: Path) -> None:
     assert run("copy", scene, "b.db")[0] == 0
     with hapticdb.open("b.db") as env:
         for n in range(2 * render.MOST_ROWS):
@@ -79,7 +79,7 @@ def test_many_differences_are_cut_and_counted(run: Run, scene: Path) -> None:
     assert lines[-1].startswith(cut)
 
 
-def test_other_grids_are_a_difference(run: Run, scene: Path) -> None:
+def test_diff_other_grid(run: Run, scene: Path) -> None:
     hapticdb.create("b.db", Grid(0.01, (0, 0, 0), 6)).close()
     code, out, _ = run("diff", scene, "b.db")
     assert code == 1
@@ -89,14 +89,14 @@ def test_other_grids_are_a_difference(run: Run, scene: Path) -> None:
 
 @pytest.mark.usefixtures("scene")
 @pytest.mark.parametrize("args", [["scene.db", "none.db"], ["none.db", "scene.db"]])
-def test_a_diff_with_nothing_is_an_error(run: Run, args: list[str]) -> None:
+def test_diff_missing_environment(run: Run, args: list[str]) -> None:
     refused(run("diff", *args), "no environment at none.db")
 
 
 # -- interrupted, and on a terminal ---------------------------------------------------------------
 
 
-def test_a_copy_that_is_interrupted_says_that_it_goes_on(
+def test_copy_resumes_after_interrupt(
     run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add, left = FileTables.add, [1]
@@ -118,5 +118,5 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(
 
 
 @pytest.mark.usefixtures("run")
-def test_a_terminal_sees_a_bar(scene: Path) -> None:
+def test_copy_bar_on_terminal(scene: Path) -> None:
     assert "copying" in on_terminal("copy", scene, "b.db")

@@ -37,7 +37,7 @@ def touches(folder: Path) -> list[hapticdb.Touch]:
         return [env.touch(shell, pose) for pose in hapticdb.read_poses(folder / "path.csv")]
 
 
-def test_a_touched_path_is_written_to_the_last_bit(run: Run, scene: Path) -> None:
+def test_touch_csv_exact_digits(run: Run, scene: Path) -> None:
     out = succeeded(run(*TOUCH, "--csv", "felt.csv"))
     assert "peak force" in out
     header, rows = table(scene.with_name("felt.csv").read_text())
@@ -56,7 +56,7 @@ def test_a_touched_path_is_written_to_the_last_bit(run: Run, scene: Path) -> Non
     assert not list(scene.parent.glob(".*"))
 
 
-def test_contacts_are_written_with_their_objects(run: Run, scene: Path) -> None:
+def test_touch_contacts_csv_objects(run: Run, scene: Path) -> None:
     out = succeeded(run(*TOUCH, "--contacts-csv", "-"))
     header, rows = table(out)
     assert header == columns(CONTACTS)
@@ -75,7 +75,7 @@ def test_contacts_are_written_with_their_objects(run: Run, scene: Path) -> None:
         )
 
 
-def test_names_are_text_to_a_spreadsheet_and_to_a_terminal(run: Run, scene: Path) -> None:
+def test_csv_names_escaped(run: Run, scene: Path) -> None:
     names = [
         '=HYPERLINK("x")',
         "+1",
@@ -128,7 +128,7 @@ def recording(scene: Path) -> Path:
     return path
 
 
-def test_a_recording_is_written_to_the_last_bit(run: Run, recording: Path) -> None:
+def test_replay_csv_exact_digits(run: Run, recording: Path) -> None:
     code, out, err = run("replay", "felt.hdbrec", "--csv", "frames.csv")
     assert (code, out, err) == (0, "frames.csv: 5,000 frames\n", "")
     header, rows = table(recording.with_name("frames.csv").read_text())
@@ -146,7 +146,7 @@ def test_a_recording_is_written_to_the_last_bit(run: Run, recording: Path) -> No
     assert (code, err, out) == (0, "", recording.with_name("frames.csv").read_text())
 
 
-def test_a_torn_last_frame_is_left_out_with_a_line(run: Run, recording: Path) -> None:
+def test_replay_csv_torn_last_frame(run: Run, recording: Path) -> None:
     recording.write_bytes(recording.read_bytes()[:-100])
     code, out, err = run("replay", "felt.hdbrec", "--csv", "cut.csv")
     assert (code, out) == (0, "cut.csv: 4,999 frames\n")
@@ -156,7 +156,9 @@ def test_a_torn_last_frame_is_left_out_with_a_line(run: Run, recording: Path) ->
     assert len(err.splitlines()) == 1
 
 
-def test_a_full_disk_leaves_no_file(run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_csv_disk_full_leaves_no_file(
+    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(_: CsvWriter, __: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -183,7 +185,7 @@ def test_a_full_disk_leaves_no_file(run: Run, scene: Path, monkeypatch: pytest.M
         (["touch", "none.db", *TOUCH[2:], "--csv", "-"], ["none.db"]),
     ],
 )
-def test_a_mistake_is_one_line_and_writes_nothing(
+def test_csv_bad_arguments_write_nothing(
     run: Run, scene: Path, args: list[str], words: list[str]
 ) -> None:
     before = {path.name: path.read_bytes() for path in scene.parent.iterdir()}

@@ -14,7 +14,7 @@ from extraction_scenes import enclosed, lid
 from hapticdb.poses import write_poses
 
 
-def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
+def test_extract_path_confirmed_by_sweep(run: Run, scene: Path) -> None:
     """Three boxes in a row, 0.1 m apart: the middle one comes out to the side."""
     words = ("--motions", 0, "--out", 100)
     out = succeeded(run("extract", scene, "box1", *words, "--path", "out.csv"))
@@ -28,7 +28,7 @@ def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
     assert (code, out[:5]) == (0, "clear")
 
 
-def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
+def test_extract_json_documented_keys(run: Run, tmp_path: Path) -> None:
     out = succeeded(run("extract", lid(tmp_path, 0.0), "lid", "--motions", 0, "--json"))
     found = json.loads(out)
     assert list(found) == [
@@ -42,7 +42,7 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
     assert [obj["name"] for obj in found["near"]] == ["pot"]
 
 
-def test_a_pose_is_reached_by_numbers_and_by_a_file(run: Run, scene: Path) -> None:
+def test_extract_goal_pose_numbers_or_file(run: Run, scene: Path) -> None:
     out = succeeded(run("extract", scene, "box1", "--to", "0,0,30cm,1,0,0,0", "--path", "to.csv"))
     assert out.startswith("reaches the pose straight, 0.3 m, ")
     goal = hapticdb.read_poses("to.csv")[-1:]
@@ -52,7 +52,7 @@ def test_a_pose_is_reached_by_numbers_and_by_a_file(run: Run, scene: Path) -> No
     assert (code, json.loads(out)["to"]) == (0, goal[0].tolist())
 
 
-def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
+def test_extract_blockers_table(run: Run, tmp_path: Path) -> None:
     url = enclosed(tmp_path)
     code, out, err = run("extract", url, "block", "--motions", 0, "--path", "out.csv")
     assert (code, err) == (1, "")
@@ -69,9 +69,7 @@ def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
     assert 1 < found["blockers"][0]["pulls"] <= found["pulls"]
 
 
-def test_wrong_arguments_are_refused(
-    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_extract_bad_arguments(run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     refused(run("extract", scene, "nut"), "WORDS: no object 'nut'")
     refused(run("extract", scene), "WORDS")
     refused(run("extract", "missing.db", "box0"), "missing.db")
@@ -87,7 +85,7 @@ def test_wrong_arguments_are_refused(
 
 
 @pytest.mark.long
-def test_an_order_is_printed_and_each_step_is_written(run: Run, tmp_path: Path) -> None:
+def test_extract_disassemble_writes_each_step(run: Run, tmp_path: Path) -> None:
     url = made_of(tmp_path, STACK)
     words = ("--disassemble", "--keep", "pot", "--motions", 0)
     out = succeeded(run("extract", url, "lid", *words, "--path", "off.csv"))
@@ -101,7 +99,7 @@ def test_an_order_is_printed_and_each_step_is_written(run: Run, tmp_path: Path) 
     assert run("sweep", url, "--part", "lid", "--path", "off-2.csv", *excluded)[0] == 0
 
 
-def test_json_of_an_order_has_a_proof_a_step(run: Run, tmp_path: Path) -> None:
+def test_extract_disassemble_json_proof_per_step(run: Run, tmp_path: Path) -> None:
     url = made_of(tmp_path, STACK)
     words = ("--disassemble", "--keep", "pot", "--motions", 0, "--json")
     code, out, _ = run("extract", url, "lid", *words)
@@ -116,7 +114,7 @@ def test_json_of_an_order_has_a_proof_a_step(run: Run, tmp_path: Path) -> None:
     assert found["failed"][0]["blockers"][0].keys() == {"id", "name", "pulls"}
 
 
-def test_no_order_is_a_table_of_what_was_tried(run: Run, tmp_path: Path) -> None:
+def test_extract_disassemble_blocked_table(run: Run, tmp_path: Path) -> None:
     url = made_of(tmp_path, CHAIN)
     words = ("--disassemble", "--motions", 0, "--path", "off.csv", "--animation", "off.html")
     code, out, err = run("extract", url, "left", *words)

@@ -44,7 +44,7 @@ def feel(*args: object) -> tuple[object, ...]:
 
 
 @pytest.mark.usefixtures("scene")
-def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run) -> None:
+def test_feel_path_without_times_speed(run: Run) -> None:
     request = feel("--device", "path.csv", "--seconds", 0.2, "--no-baseline")
     out = succeeded(run(*request))
     assert re.search(r"^ *played at +0\.1 m/s: the path has no times", out, re.MULTILINE)
@@ -52,7 +52,7 @@ def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run) -> None:
     assert json.loads(run(*request, "--json", "--speed", 0.2)[1])["path_speed"] is None
 
 
-def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) -> None:
+def test_feel_recorded_then_replayed(run: Run, scene: Path) -> None:
     """A replay reports a difference once an object has moved."""
     out = succeeded(run(*feel(*PLAY, "--speed", 0.5, "--record", "felt.hdbrec")))
     lines = [line.strip() for line in out.splitlines()]
@@ -104,7 +104,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
         (20_000, 5000.0, "plane", "takes about 1 ms, and 5,000 Hz leave 0.2 ms"),
     ],
 )
-def test_what_a_large_tool_costs_is_said_in_a_line(
+def test_note_cost_large_tool(
     n_points: int, rate: float, law: LawName, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     note_cost(n_points, rate, law)
@@ -114,7 +114,7 @@ def test_what_a_large_tool_costs_is_said_in_a_line(
 
 
 @pytest.mark.usefixtures("scene")
-def test_a_terminal_sees_what_is_waited_for_and_how_long_it_took() -> None:
+def test_feel_terminal_shows_progress() -> None:
     request = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.6)
     shown = on_terminal(*request)
     for doing in ("loading", "sampling the tool", "measuring an empty loop", "feeling; Ctrl-C"):
@@ -123,7 +123,7 @@ def test_a_terminal_sees_what_is_waited_for_and_how_long_it_took() -> None:
 
 
 @pytest.mark.usefixtures("scene")
-def test_a_simulated_device_is_pushed_back(run: Run) -> None:
+def test_feel_simulated_device(run: Run) -> None:
     args = ("--device", "random", "--at", "0,0,0.05", "--seconds", 0.5, "--simulate", "--seed", 2)
     report = json.loads(succeeded(run(*feel(*args, "--rate", 200, "--no-baseline", "--json"))))
     assert report["unknown_frames"] == 0
@@ -166,14 +166,14 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         ([*LIMITED, "4 parsecs"], ["--record-limit", "'4 parsecs': give MiB"]),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_no_process(
+def test_feel_bad_arguments_leave_no_process(
     run: Run, args: list[object], words: list[str]
 ) -> None:
     refused(run(*feel(*args)), *words)
     assert processes() == set()
 
 
-def test_the_fork_server_starts_before_all_else(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_feel_starts_fork_server_first(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
 
     def refuse(*_: object) -> None:
@@ -188,7 +188,7 @@ def test_the_fork_server_starts_before_all_else(run: Run, monkeypatch: pytest.Mo
     ]  # fmt: skip
 
 
-def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path) -> None:
+def test_feel_missing_environment_or_tool(run: Run, scene: Path) -> None:
     path = scene.with_name("path.csv")
     missing = run("feel", "nowhere.db", "--tool", "tool.npz", *PLAY)
     refused(missing, "nowhere.db", "hapticdb import")
@@ -199,7 +199,7 @@ def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path
     refused(run("feel", "lexical.db", "--tool", "tool.npz", *PLAY), "lexicographic", "--curve z")
 
 
-def test_a_recording_is_replaced(run: Run, scene: Path) -> None:
+def test_feel_record_replace(run: Run, scene: Path) -> None:
     path = scene.with_name("felt.hdbrec")
     args = (*feel(*PLAY, "--seconds", 0.2), "--record", path)
     assert run(*args)[0] == 0
@@ -211,7 +211,7 @@ def test_a_recording_is_replaced(run: Run, scene: Path) -> None:
     assert recorded(path)[:1].tobytes() != first[:1].tobytes()
 
 
-def test_a_database_that_is_gone_is_told_while_the_session_runs_and_at_its_end(
+def test_feel_reports_lost_database(
     scene: Path,
 ) -> None:
     args = feel(*RANDOM, "--seconds", 2, "--record", "s.hdbrec", "--json")
@@ -230,7 +230,7 @@ def test_a_database_that_is_gone_is_told_while_the_session_runs_and_at_its_end(
 
 
 @pytest.mark.long
-def test_a_session_whose_server_hangs_says_so_and_ends(scene: Path, tmp_path: Path) -> None:
+def test_feel_hanging_server_ends_session(scene: Path, tmp_path: Path) -> None:
     """The server is stopped with a session's connection open, until the session has ended."""
     with serving(tmp_path / "pg", FOUND[0], SETTINGS) as server:
         url = server.conninfo() + "&environment=scene"
@@ -255,7 +255,7 @@ def test_a_session_whose_server_hangs_says_so_and_ends(scene: Path, tmp_path: Pa
 
 
 @pytest.mark.long
-def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Path) -> None:
+def test_feel_continues_without_recording_on_disk_error(scene: Path) -> None:
     args = feel(*RANDOM, "--rate", 5000, "--record", "cut.hdbrec")
     path = scene.with_name("cut.hdbrec")
     with child(command(*args, "--json"), cwd=scene.parent) as process:
@@ -278,7 +278,7 @@ def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Pat
 @pytest.mark.parametrize(
     ("text", "n_bytes"), [("1", 1 << 20), ("1.5 GiB", 3 << 29), ("4g", 4 << 30)]
 )
-def test_a_size_is_mib_or_has_its_unit(text: str, n_bytes: int) -> None:
+def test_size_of_units(text: str, n_bytes: int) -> None:
     assert size_of(text) == n_bytes
 
 
@@ -297,7 +297,7 @@ def frames_in(path: Path) -> bool:
 @pytest.mark.parametrize(
     ("number", "code", "words"), [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")]
 )
-def test_a_signal_ends_a_session_with_its_report(
+def test_feel_signal_ends_with_report(
     scene: Path, number: signal.Signals, code: int, words: str
 ) -> None:
     """Its recording then has every frame."""
@@ -322,7 +322,7 @@ def test_a_signal_ends_a_session_with_its_report(
     assert not any(map(is_alive, started))
 
 
-def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
+def test_feel_ctrl_c_before_first_frame(scene: Path) -> None:
     args = feel(*RANDOM)
     with child(command(*args), cwd=scene.parent) as process:
         until(lambda: descendants(process.pid), every=0.002)
@@ -337,7 +337,7 @@ def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
     until(lambda: not any(map(is_alive, started)))
 
 
-def test_sigterm_before_the_first_frame_leaves_nothing(scene: Path) -> None:
+def test_feel_sigterm_before_first_frame(scene: Path) -> None:
     args = feel(*RANDOM, "--record", "never.hdbrec")
     path = scene.with_name("never.hdbrec")
     with child(command(*args), cwd=scene.parent) as process:

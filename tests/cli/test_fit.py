@@ -51,9 +51,7 @@ def lifts(frames: list[dict[str, object]]) -> list[float]:
     return [frame["force"][2] for frame in frames]  # type: ignore[index]
 
 
-def test_contact_begins_at_the_surface_unless_the_tool_is_conservative(
-    run: Run, floor: Path
-) -> None:
+def test_touch_distance_law_contact_at_surface(run: Run, floor: Path) -> None:
     frames = touched(run, floor)
     assert {frame["law"] for frame in frames} == {"distance"}
     above, below = lifts(frames)
@@ -71,9 +69,7 @@ def test_contact_begins_at_the_surface_unless_the_tool_is_conservative(
     assert "on the surface" in run(*args, "--conservative")[1]
 
 
-def test_a_saved_shell_that_was_drawn_in_is_told_where_clearance_counts(
-    run: Run, floor: Path
-) -> None:
+def test_touch_inset_shell_late_contact_note(run: Run, floor: Path) -> None:
     hapticdb.PointShell.from_file("tool.stl", 100, inset=0.002).save("drawn.npz")
     args = ("touch", floor, "--tool", "drawn.npz", "--poses", "path.csv", "--json")
     for more, late in (((), "0.5 mm"), (("--conservative",), "2 mm"), (("--law", "plane"), "2 mm")):
@@ -82,7 +78,7 @@ def test_a_saved_shell_that_was_drawn_in_is_told_where_clearance_counts(
         assert f"drawn in by 2 mm: contact begins up to {late} late" in err
 
 
-def test_a_tool_that_is_felt_is_drawn_in_unless_it_is_conservative(run: Run, floor: Path) -> None:
+def test_feel_tool_inset_unless_conservative(run: Run, floor: Path) -> None:
     args = ("feel", floor, "--tool", "tool.stl", "--device", "path.csv", "--seconds", 0.2)
     rest = ("--no-baseline", "--json")
     for more, inset in (((), 1.5 * VOXEL), (("--conservative",), 0.0), (("--law", "plane"), 0.0)):
@@ -91,7 +87,7 @@ def test_a_tool_that_is_felt_is_drawn_in_unless_it_is_conservative(run: Run, flo
         assert json.loads(out)["shell"]["inset"] == {"least": inset, "greatest": inset}
 
 
-def test_a_tool_that_is_kept_is_told_of_alike_and_loads_no_scipy(run: Run, floor: Path) -> None:
+def test_touch_cached_shell_same_forces_without_scipy(run: Run, floor: Path) -> None:
     cube = tool(floor.with_name("tool.stl"), is_open=True)
     comment = os.urandom(40).hex().encode()  # so that it is not kept yet
     cube.write_bytes(comment + cube.read_bytes()[80:])

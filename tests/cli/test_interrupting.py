@@ -36,7 +36,7 @@ else:
 
 
 @pytest.mark.parametrize("at", drawn(range(1, 521), 3))
-def test_ctrl_c_within_any_import_is_one_line(scene: Path, at: int) -> None:
+def test_interrupting_ctrl_c_during_import(scene: Path, at: int) -> None:
     how = "module" if at % 2 else "script"
     done = finished([sys.executable, "-c", AT_IMPORT, str(at), how, "objects", str(scene)])
     if done.returncode == 0:  # there are fewer imports than `at`
@@ -64,13 +64,13 @@ except KeyboardInterrupt:
 """A program that is interrupted between two lines of a module of llvmlite."""
 
 
-def test_llvmlite_notes_what_it_gave_away_before_ctrl_c_is_raised() -> None:
+def test_interrupting_ctrl_c_inside_llvmlite_deferred() -> None:
     """Its ``ExecutionEngine.add_module`` gives a module to LLVM, and notes it in the next line."""
     done = finished([sys.executable, "-c", IN_LLVMLITE])
     assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
 
 
-def test_who_ignores_ctrl_c_goes_on_ignoring_it(scene: Path) -> None:
+def test_interrupting_ignored_ctrl_c_stays_ignored(scene: Path) -> None:
     script = f"import signal; signal.signal(2, signal.SIG_IGN)\n{AT_IMPORT}"
     done = finished([sys.executable, "-c", script, "40", "module", "objects", str(scene)])
     assert (done.returncode, done.stderr) == (0, "")
@@ -95,6 +95,6 @@ except KeyboardInterrupt as error:
 """
 
 
-def test_ctrl_c_within_a_finalizer_is_not_lost() -> None:
+def test_interrupting_ctrl_c_in_finalizer_not_lost() -> None:
     done = finished([sys.executable, "-c", FINALIZED])
     assert (done.stdout, done.stderr) == ("raised \n", "")

@@ -48,7 +48,7 @@ CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9, "full disk": 2}
     ],
     ids=lambda value: value if isinstance(value, str) else named(value),
 )
-def test_a_move_cut_off_moves_none(
+def test_move_interrupted_is_atomic(
     run: Run, scene: Path, engine: Binaries | None, how: str
 ) -> None:
     with url_on(engine, scene.parent) as url:

@@ -32,7 +32,7 @@ def listed(run: Run, url: Path, *words: object) -> list[str]:
     return [json.loads(line)["name"] for line in out.splitlines()]
 
 
-def test_names_patterns_and_ids_choose(run: Run, bolts: Path) -> None:
+def test_objects_selection_by_name_pattern_id(run: Run, bolts: Path) -> None:
     assert listed(run, bolts, "--name", "bolt_5?", "--name", "plate,1") == [
         "frame/bolt_0", *(f"frame/bolt_5{n}" for n in range(10)), "plate",
     ]  # fmt: skip
@@ -40,7 +40,7 @@ def test_names_patterns_and_ids_choose(run: Run, bolts: Path) -> None:
     refused(run("objects", bolts, "--name", "nut*"), "--name: no object 'nut*'")
 
 
-def test_a_limit_cuts_and_says_so(run: Run, bolts: Path) -> None:
+def test_objects_limit(run: Run, bolts: Path) -> None:
     assert listed(run, bolts, "--limit", 2) == ["frame/bolt_0", "frame/bolt_1"]
     whole = succeeded(run("objects", bolts))
     assert (len(whole.splitlines()), "\x1b" in whole) == (2 + N_BOLTS + 1, False)
@@ -51,7 +51,7 @@ def test_a_limit_cuts_and_says_so(run: Run, bolts: Path) -> None:
     refused(run("objects", bolts, "--limit", -1), "--limit")
 
 
-def test_a_terminal_has_as_many_as_it_shows(bolts: Path) -> None:
+def test_objects_terminal_page_limit(bolts: Path) -> None:
     *lines, last = on_terminal("objects", bolts).splitlines()
     assert last == f"hapticdb: {PAGE} of 61 objects; --limit 0 shows all"
     text = "".join(lines)
@@ -59,7 +59,7 @@ def test_a_terminal_has_as_many_as_it_shows(bolts: Path) -> None:
     assert "bolt_40" not in text
 
 
-def test_a_table_is_as_narrow_as_the_terminal(bolts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_objects_table_fits_terminal(bolts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "52")
     lines = on_terminal("objects", bolts, "--limit", 3).splitlines()[:-1]
     assert max(map(len, lines)) <= 52
@@ -73,9 +73,7 @@ def test_a_table_is_as_narrow_as_the_terminal(bolts: Path, monkeypatch: pytest.M
     assert re.search(r"scene +.*\n +\S", shown)  # goes on below its beginning
 
 
-def test_a_verdict_has_a_colour_on_a_terminal_unless_none_is_wanted(
-    bolts: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_verdict_colour(bolts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "\x1b[32m" in on_terminal("check", bolts)
     monkeypatch.setenv("NO_COLOR", "1")
     assert "\x1b[3" not in on_terminal("check", bolts).rpartition("\x1b[2K")[2]
@@ -84,7 +82,7 @@ def test_a_verdict_has_a_colour_on_a_terminal_unless_none_is_wanted(
 # -- columns --------------------------------------------------------------------------------------
 
 
-def test_columns_stand_below_their_headings(
+def test_table_column_alignment(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [("1", "short", "10"), ("12", "a somewhat longer text", "9,000"), ("3", "部品", "")]

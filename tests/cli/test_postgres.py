@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
-    test_calibrate_prints_figures_with_their_spread,
-    test_info_json_is_what_the_library_says,
-    test_info_speaks_to_people,
-    test_statistics_are_renewed_after_many_edits,
+    test_info_calibrate_spread,
+    test_info_json_equals_library,
+    test_info_renews_statistics_after_many_edits,
+    test_info_text,
 )
 from command_line import Run, refused, rows_of
 from hapticdb.store.urls import redact
@@ -34,7 +34,7 @@ def scene(run: Run, made: Path, tmp_path: Path, place: Place) -> str:
 
 
 @pytest.mark.parametrize("layout", ["brick", "voxel"])
-def test_an_import_holds_the_rows_of_one_into_a_file(
+def test_import_postgres_same_rows_as_sqlite(
     run: Run, made: Path, place: Place, layout: str
 ) -> None:
     url, file = place(), made / "boxes.glb"
@@ -55,14 +55,14 @@ def test_an_import_holds_the_rows_of_one_into_a_file(
 # -- failures that only a server has --------------------------------------------------------------
 
 
-def test_no_server_is_one_line(run: Run, tmp_path: Path) -> None:
+def test_info_postgres_unreachable(run: Run, tmp_path: Path) -> None:
     refused(run("info", f"postgresql:///x?host={tmp_path}"), "cannot be reached")
     refused(run("info", "postgresql://127.0.0.1:1/x"), "cannot be reached", "refused")
     unescaped = "postgresql://me:h@nter@localhost:1/x"
     assert "nter" not in refused(run("info", unescaped), "%40")
 
 
-def test_a_missing_database_is_one_line(run: Run, database: str, made: Path) -> None:
+def test_info_postgres_missing_database(run: Run, database: str, made: Path) -> None:
     url = re.sub(r"(://[^/]*)/[^?]*", r"\1/nowhere", database)
     refused(run("info", url), '"nowhere" does not exist', "createdb")
     refused(run("import", url, made / "boxes.glb"), '"nowhere" does not exist', "createdb")

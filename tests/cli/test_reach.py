@@ -11,7 +11,7 @@ from command_line import Run, refused, succeeded
 BESIDE = ("--tool", "tool.stl", "--axis", "0,1,0", "--step", "90deg", "--lift", "5cm")
 
 
-def test_reach_prints_a_row_for_each_target(run: Run, scene: Path) -> None:
+def test_reach_row_per_target(run: Run, scene: Path) -> None:
     """Cubes of 100 mm, 200 mm apart; the tool is a cube of 20 mm about its origin."""
     words = ("reach", scene, "box0", "box2", *BESIDE)
     lines = succeeded(run(*words)).splitlines()
@@ -27,7 +27,7 @@ def test_reach_prints_a_row_for_each_target(run: Run, scene: Path) -> None:
     assert (code, [row["gap_m"] for row in rows]) == (0, ["0.02", "0.02"])
 
 
-def test_reach_says_what_is_in_the_way(run: Run, scene: Path) -> None:
+def test_reach_names_obstacle(run: Run, scene: Path) -> None:
     """Between two cubes there are 100 mm: less than the lift and the tool."""
     between = ("--tool", "tool.stl", "--axis", "1,0,0", "--lift", "95mm", "--turn", "1rad")
     code, out, err = run("reach", scene, "box0", "box2", *between)
@@ -40,7 +40,7 @@ def test_reach_says_what_is_in_the_way(run: Run, scene: Path) -> None:
     assert run("reach", scene, "box1", *between, "--seconds", "1e-9")[0] == 3
 
 
-def test_reach_refuses_in_one_line(run: Run, scene: Path) -> None:
+def test_reach_verb_bad_arguments(run: Run, scene: Path) -> None:
     words = ("reach", scene, "box0", "--tool", "tool.stl")
     refused(run(*words), "box0", "no single axis of symmetry", "--axis")
     refused(run("reach", scene, "nut", *words[3:]), "WORDS", "nut")

@@ -26,7 +26,7 @@ HIT = place_at(SEAT, 0.25, PATH)
 DEEP = HIT._replace(at_least=2e-3)
 
 
-def test_a_sweep_as_json_has_no_infinity() -> None:
+def test_sweep_json_no_infinity() -> None:
     both = touching(SEAT, 0.6), touching(BOLT, 0.0, by="", start=np.inf)
     found = swept(gap=GAP, hits=(HIT,), touching=both, enclosed=(LID,))
     record = json.loads(json.dumps(plain(found), allow_nan=False))
@@ -42,7 +42,7 @@ def rows_of(found: Swept) -> list[dict[str, str]]:
     return [*csv.DictReader(stream.getvalue().splitlines())]
 
 
-def test_a_sweep_as_csv_has_a_row_for_each_object_that_is_met() -> None:
+def test_sweep_csv_row_per_hit_object() -> None:
     hit = place_at(BOLT, 0.5, PATH)
     found = swept(hits=(hit, DEEP), touching=(touching(SEAT, 0.6),), enclosed=(LID,))
     rows = rows_of(found)
@@ -77,7 +77,7 @@ def keys_of(told: object) -> Iterator[str]:
         yield from () if key in BY_NAME else keys_of(one)
 
 
-def test_the_page_has_every_key_that_a_verb_prints(run: Run, scene: Path) -> None:
+def test_results_page_documents_each_key(run: Run, scene: Path) -> None:
     seen = {
         text.partition("=")[0] for names in (*FIELDS.values(), OBJECT) for text in names.split()
     }
@@ -101,7 +101,7 @@ def test_the_page_has_every_key_that_a_verb_prints(run: Run, scene: Path) -> Non
     assert not seen - UNITS.keys()
 
 
-def test_the_columns_of_csv_end_in_the_unit_of_their_key() -> None:
+def test_csv_columns_end_in_unit() -> None:
     for key, columns in COLUMNS.items():
         if unit := UNITS[key].replace(" ", ""):
             assert {name.rpartition("_")[2] for name in columns} == {unit}, key

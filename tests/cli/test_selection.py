@@ -16,7 +16,7 @@ def ids_in(scene: Path) -> list[int]:
         return [obj.id for obj in env.objects()]
 
 
-def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
+def test_filter_same_objects_for_each_verb(run: Run, scene: Path) -> None:
     """The same words for touch, sweep and feel; --exclude leaves out some of what is chosen."""
 
     def hits(*words: str) -> list[int]:
@@ -44,7 +44,7 @@ def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
 
 
 @pytest.mark.parametrize("parts", [("1", "--part", "3"), ("box[02]",)])
-def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...]) -> None:
+def test_part_option_several_parts_one_tool(run: Run, scene: Path, parts: tuple[str, ...]) -> None:
     """Boxes 0 and 2 are one tool; box 1, between them, is in the way of box 0."""
     up = poses(scene.parent / "up.csv", (0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
     aside = poses(scene.parent / "aside.csv", (0.0, 0.0, 0.0), (0.15, 0.0, 0.0))
@@ -58,7 +58,7 @@ def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...
     assert run("sweep", scene, "--part", "3", "--path", aside)[0] == 0
 
 
-def test_move_and_remove_take_several(run: Run, scene: Path) -> None:
+def test_move_remove_several_objects(run: Run, scene: Path) -> None:
     out = succeeded(run("move", scene, "box[01]", 3, "--translate", "0,0,0.01", "--json"))
     assert [json.loads(line)["id"] for line in out.splitlines()] == [1, 2, 3]
     placed = ("--matrix", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1")
@@ -71,7 +71,7 @@ def test_move_and_remove_take_several(run: Run, scene: Path) -> None:
     assert ids_in(scene) == [1]
 
 
-def test_a_number_is_an_id_or_else_a_name_and_a_verb_says_which(run: Run, tmp_path: Path) -> None:
+def test_words_number_is_id_then_name(run: Run, tmp_path: Path) -> None:
     corners = "".join(f"v {x} 0 {y}\n" for x, y in ((0, 0), (1, 0), (0, 1)))
     faces = "".join(f"o {name}\nf 1 2 3\n" for name in ("2", "4711", "body", "9"))
     (tmp_path / "numbers.obj").write_text(corners + faces)

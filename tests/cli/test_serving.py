@@ -32,7 +32,7 @@ def scene(tmp_path: Path) -> Path:
         ("editor=short", "tokens, line 1: "), ("editor=short", "16"), ("editor", "ROLE="),
     ],
 )  # fmt: skip
-def test_a_mistake_is_one_line_and_starts_nothing(
+def test_view_serve_bad_arguments_start_nothing(
     scene: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -54,7 +54,7 @@ def test_a_mistake_is_one_line_and_starts_nothing(
 
 
 @pytest.mark.parametrize("verb", ["view", "serve"])
-def test_a_coupling_is_refused_at_the_start_where_no_object_can_have_distances(
+def test_view_serve_coupling_without_distances(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, verb: str
 ) -> None:
     started: list[str] = []
@@ -68,7 +68,7 @@ def test_a_coupling_is_refused_at_the_start_where_no_object_can_have_distances(
     assert "leave out --rendering coupled" in told.err
 
 
-def test_a_token_file_may_have_a_byte_order_mark_and_comments(tmp_path: Path) -> None:
+def test_tokens_file_with_bom_and_comments(tmp_path: Path) -> None:
     (file := tmp_path / "tokens").write_text(
         "\ufeff# of the workshop\neditor=0123456789abcdef\n\n  # viewer=no\n", "utf-8"
     )
@@ -76,7 +76,7 @@ def test_a_token_file_may_have_a_byte_order_mark_and_comments(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("rendering", [None, "coupled", "direct"])
-def test_a_rendering_reaches_host_and_page(scene: Path, rendering: RenderingName | None) -> None:
+def test_serving_rendering_option(scene: Path, rendering: RenderingName | None) -> None:
     machine = MachineOptions(str(scene), at="0,0,1000,1,0,0,0")
     serving = PageOptions(rendering=rendering).serving(str(scene), {}, machine)
     assert serving.rendering == rendering

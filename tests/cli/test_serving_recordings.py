@@ -23,9 +23,7 @@ GRID = Grid(0.01, (0.0, 0.0, 0.0), 6)
 
 @pytest.mark.long
 @pytest.mark.parametrize(("verb", "option"), [("serve", "--token"), ("view", "--no-browser")])
-def test_sigterm_keeps_a_recording_that_is_under_way(
-    tmp_path: Path, verb: str, option: str
-) -> None:
+def test_serve_view_sigterm_keeps_recording(tmp_path: Path, verb: str, option: str) -> None:
     scene, folder = tmp_path / "scene.db", tmp_path / "recordings"
     with hapticdb.create(scene, GRID) as env:
         floor = floor_voxels(GRID)

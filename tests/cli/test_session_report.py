@@ -21,7 +21,7 @@ def report(**figures: Any) -> Any:  # noqa: ANN401 - of a stand-in
     return SimpleNamespace(**(told | {"enclosing_objects": (3,)} | figures))
 
 
-def test_a_tool_in_an_object_is_told_once_and_so_is_its_freedom(
+def test_notes_inside_object_once_then_free(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     notes = session_report.Notes()
@@ -35,7 +35,7 @@ def test_a_tool_in_an_object_is_told_once_and_so_is_its_freedom(
     assert capsys.readouterr().err.count("the tool is free") == 1
 
 
-def test_a_name_may_come_a_look_later_and_none_may_come_at_all(
+def test_notes_inside_object_name_late_or_missing(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     notes = session_report.Notes()
@@ -55,7 +55,5 @@ def test_a_name_may_come_a_look_later_and_none_may_come_at_all(
         ({"ended_inside": False}, "until it was free"),
     ],
 )
-def test_the_report_says_in_what_for_how_long_and_whether_it_came_free(
-    figures: dict[str, Any], said: str
-) -> None:
+def test_inside_text_object_duration_and_end(figures: dict[str, Any], said: str) -> None:
     assert said in session_report.inside_text(report(**figures), AWAY)  # type: ignore[arg-type]

@@ -39,7 +39,7 @@ def along(scene: Path) -> Path:
 
 
 @pytest.mark.usefixtures("free")
-def test_what_is_clear_is_said_with_its_gap(run: Run, scene: Path) -> None:
+def test_sweep_clear_gap(run: Run, scene: Path) -> None:
     out = succeeded(run("sweep", scene, *TOOL, "--path", "free.csv"))
     found = json.loads(run("sweep", scene, *TOOL, "--path", "free.csv", "--json")[1])
     assert found["verdict"] == "clear"
@@ -50,7 +50,7 @@ def test_what_is_clear_is_said_with_its_gap(run: Run, scene: Path) -> None:
 
 
 @pytest.mark.usefixtures("through")
-def test_what_is_hit_is_said_with_where(run: Run, scene: Path) -> None:
+def test_sweep_hit_position(run: Run, scene: Path) -> None:
     code, out, err = run("sweep", scene, *TOOL, "--path", "through.csv")
     assert (code, err) == (1, "")
     first, *rest = out.splitlines()
@@ -63,14 +63,14 @@ def test_what_is_hit_is_said_with_where(run: Run, scene: Path) -> None:
 
 
 @pytest.mark.usefixtures("along")
-def test_what_slides_at_its_start_is_no_hit(run: Run, scene: Path) -> None:
+def test_sweep_sliding_start_is_clear(run: Run, scene: Path) -> None:
     sweep = ("sweep", scene, *TOOL, "--path", "along.csv")
     out = succeeded(run(*sweep))
     assert out.startswith("slides along box0 until 12.6 % of the path, otherwise clear by ")
     refused(run(*sweep, "--contact", 0), "contact")
 
 
-def test_a_path_may_turn_about_another_centre(run: Run, scene: Path) -> None:
+def test_sweep_about_other_centre(run: Run, scene: Path) -> None:
     """160 degrees take the tool through the first box, or about the box's middle round it."""
     poses = "0,0,0.1,1,0,0,0\n0.0342020143,0,-0.0939692621,0.1736481777,0,0.984807753,0\n"
     text = f"x,y,z,qw,qx,qy,qz\n{poses}"
@@ -85,7 +85,7 @@ def test_a_path_may_turn_about_another_centre(run: Run, scene: Path) -> None:
 
 
 @pytest.mark.usefixtures("through")
-def test_a_sweep_is_written_as_csv(run: Run, scene: Path) -> None:
+def test_sweep_csv_row_per_hit(run: Run, scene: Path) -> None:
     sweep = ("sweep", scene, *TOOL, "--path", "through.csv")
     found = json.loads(run(*sweep, "--json")[1])
     assert run(*sweep, "--csv", "hit.csv")[0] == 1
@@ -101,7 +101,7 @@ def test_a_sweep_is_written_as_csv(run: Run, scene: Path) -> None:
 
 
 @pytest.mark.usefixtures("free", "through", "along")
-def test_many_sweeps_are_one_command(run: Run, scene: Path) -> None:
+def test_sweep_batch_file(run: Run, scene: Path) -> None:
     many = scene.with_name("many.csv")
     many.write_text(
         "tool,part,path,exclude,contact\n"
@@ -134,15 +134,13 @@ def test_many_sweeps_are_one_command(run: Run, scene: Path) -> None:
         ('part,path\n"1,path.csv\n', "unexpected end"), ("\0", "--batch"),
     ],
 )  # fmt: skip
-def test_a_wrong_file_of_sweeps_is_one_line(run: Run, scene: Path, text: str, told: str) -> None:
+def test_sweep_bad_batch_file(run: Run, scene: Path, text: str, told: str) -> None:
     scene.with_name("many.csv").write_text(text)
     refused(run("sweep", scene, "--batch", "many.csv"), told)
 
 
 @pytest.mark.usefixtures("free")
-def test_others_who_write_meanwhile_are_told_of(
-    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sweep_concurrent_edit_note(run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     swept_by = sweeping.sweep
 
     def disturbed(*args: object, **options: object) -> object:
@@ -165,7 +163,7 @@ def test_others_who_write_meanwhile_are_told_of(
     ],
 )
 @pytest.mark.parametrize("args", [("touch", "--poses"), ("sweep", "--path")])
-def test_a_tool_of_the_wrong_size_is_noted(
+def test_sweep_feel_tool_unit_hint(
     run: Run, scene: Path, args: tuple[str, str], lengths: tuple[float], told: str, hint: str
 ) -> None:
     trimesh.creation.box(lengths * 3).export(scene.parent / "wrong.stl")
@@ -177,7 +175,7 @@ def test_a_tool_of_the_wrong_size_is_noted(
     assert run(*words, "--tool-unit", "m")[2] == ""
 
 
-def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
+def test_sweep_bad_arguments(run: Run, scene: Path) -> None:
     path = ("--path", "path.csv")
     refused(run("sweep", scene, *path), "--tool and --part")
     refused(run("sweep", scene, *TOOL), "--path", "--batch")
@@ -206,7 +204,7 @@ def seam(tmp_path: Path) -> Path:
         return url
 
 
-def test_an_overlap_at_the_start_has_a_code_of_its_own(
+def test_sweep_extract_overlap_at_start_exit_code(
     run: Run, seam: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(seam.parent)
@@ -234,7 +232,9 @@ def test_an_overlap_at_the_start_has_a_code_of_its_own(
     assert code == 4
 
 
-def test_a_foreign_tool_has_no_seat(run: Run, seam: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sweep_foreign_tool_overlap_is_hit(
+    run: Run, seam: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(seam.parent)
     corners = shell_of(box((100.0, 60.0, 1.0))).outline
     write_obj(Path("hood.obj"), {"hood": (corners, np.arange(len(corners)).reshape(-1, 3))})
@@ -267,7 +267,7 @@ def test_sweep_envelope_is_stored_and_replaced(run: Run, scene: Path) -> None:
     refused(run(*words[:-1], "fine", "--envelope-voxel", "1um"), "1 µm", "would do")
 
 
-def test_sweep_envelope_stores_that_of_a_machine(run: Run, scene: Path) -> None:
+def test_sweep_envelope_of_machine_stored(run: Run, scene: Path) -> None:
     scene.with_name("crane.urdf").write_text(
         '<robot name="crane"><link name="base"/><link name="hook"><collision><geometry>'
         '<box size="0.02 0.02 0.02"/></geometry></collision></link><joint name="lift" '

@@ -19,7 +19,7 @@ Scene = Path | str
 # -- info, objects -------------------------------------------------------------------------------
 
 
-def test_info_json_is_what_the_library_says(run: Run, scene: Scene) -> None:
+def test_info_json_equals_library(run: Run, scene: Scene) -> None:
     found = json.loads(succeeded(run("info", scene, "--json")))
     with hapticdb.open(scene, read_only=True) as env:
         assert found["voxels"] == sum(len(env.voxels(obj.id)) for obj in env.objects())
@@ -30,7 +30,7 @@ def test_info_json_is_what_the_library_says(run: Run, scene: Scene) -> None:
     assert (found["curve"], found["layout"], found["objects"]) == ("z", "brick", 3)
 
 
-def test_info_speaks_to_people(run: Run, scene: Scene) -> None:
+def test_info_text(run: Run, scene: Scene) -> None:
     out = succeeded(run("info", scene))
     assert "262,144 cells" in out
     assert "a voxel)" in out
@@ -38,7 +38,7 @@ def test_info_speaks_to_people(run: Run, scene: Scene) -> None:
     assert re.search(r"^statistics +computed and kept; fresh$", out, re.MULTILINE)
 
 
-def test_statistics_are_renewed_after_many_edits(run: Run, scene: Scene) -> None:
+def test_info_renews_statistics_after_many_edits(run: Run, scene: Scene) -> None:
     """Of 3 objects each edit is many; a store alone counts what passes."""
     with hapticdb.open(scene) as env:
         env.store.remove(2)
@@ -48,7 +48,7 @@ def test_statistics_are_renewed_after_many_edits(run: Run, scene: Scene) -> None
     assert (found["source"], found["changes"]) == ("kept", 0)
 
 
-def test_objects_are_listed_by_id(run: Run, scene: Scene) -> None:
+def test_objects_ordered_by_id(run: Run, scene: Scene) -> None:
     out = succeeded(run("objects", scene, "--json"))
     found = [json.loads(line) for line in out.splitlines()]
     assert [(obj["id"], obj["name"]) for obj in found] == [(1, "box0"), (2, "box1"), (3, "box2")]
@@ -57,7 +57,7 @@ def test_objects_are_listed_by_id(run: Run, scene: Scene) -> None:
     assert re.search(r"2\s+box1\s+\d+\s+100 x 100 x 100\s+boxes.glb", table)
 
 
-def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> None:
+def test_info_calibrate_spread(run: Run, scene: Scene) -> None:
     with hapticdb.open(scene) as env:
         env.store.remove(2)
     found = json.loads(succeeded(run("info", scene, "--calibrate", "--json")))
@@ -70,7 +70,7 @@ def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> N
     refused(run("info", scene, "--cold"), "--calibrate")
 
 
-def test_a_distance_is_that_of_the_nearest_two(run: Run, scene: Scene) -> None:
+def test_distance_nearest_pair(run: Run, scene: Scene) -> None:
     out = succeeded(run("distance", scene, "box0", "box*"))
     assert out.startswith("box0 and box1 are 100 mm apart\non box0  (0.05, ")
     refused(run("distance", scene, "box0", "bix1"), "did you mean 'box1'")
@@ -84,9 +84,7 @@ def bounds_of(scene: Scene, object_id: int) -> Any:  # noqa: ANN401 - an array
         return env.object(object_id).bounds
 
 
-def test_a_translation_counts_from_where_the_object_is_and_a_matrix_does_not(
-    run: Run, scene: Scene
-) -> None:
+def test_move_translate_relative_matrix_absolute(run: Run, scene: Scene) -> None:
     before = bounds_of(scene, 2)
     for n in (1, 2):
         out = succeeded(run("move", scene, 2, "--translate", "-0.01,0,0.02"))
@@ -99,7 +97,7 @@ def test_a_translation_counts_from_where_the_object_is_and_a_matrix_does_not(
         assert np.allclose(np.mean(json.loads(out)["bounds"], axis=0), (0.3, 0.05, 0))
 
 
-def test_a_move_that_cannot_be_changes_nothing(run: Run, scene: Scene) -> None:
+def test_move_bad_arguments_change_nothing(run: Run, scene: Scene) -> None:
     before = rows_of(scene)
     for args, word in (
         ("1", "give one of"), ("1 --translate 1,2,3 --matrix 1", "give one of"),
@@ -117,7 +115,7 @@ def touch(run: Run, scene: Scene, *more: object) -> tuple[int, str, str]:
     return run("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", *more)
 
 
-def test_touch_json_has_a_line_a_pose(run: Run, scene: Scene) -> None:
+def test_touch_json_line_per_pose(run: Run, scene: Scene) -> None:
     code, out, err = touch(run, scene, "--json", "--strategy", "cbgroup")
     assert (code, err) == (0, "")
     found = [json.loads(line) for line in out.splitlines()]
@@ -130,7 +128,7 @@ def test_touch_json_has_a_line_a_pose(run: Run, scene: Scene) -> None:
     assert np.allclose(2 * np.array(found[0]["force"]), twice["force"])
 
 
-def test_a_saved_shell_is_a_tool(run: Run, scene: Scene) -> None:
+def test_touch_saved_shell(run: Run, scene: Scene) -> None:
     saved = touch(run, scene, "--json")[1].splitlines()
     meshed = touch(run, scene, "--json", "--tool", "tool.stl", "--conservative")[1].splitlines()
     for one, other in zip(saved, meshed, strict=True):
@@ -139,9 +137,7 @@ def test_a_saved_shell_is_a_tool(run: Run, scene: Scene) -> None:
     refused(touch(run, scene, "--tool-unit", "mm"), "saved shell")
 
 
-def test_an_open_tool_is_told_to_be_a_guess_and_its_unit_is_its_own(
-    run: Run, scene: Scene, tmp_path: Path
-) -> None:
+def test_touch_open_tool_warning_and_unit(run: Run, scene: Scene, tmp_path: Path) -> None:
     tool(tmp_path / "open.stl", is_open=True)
     code, out, err = run("touch", scene, "--tool", "open.stl", "--poses", "path.csv", "--json")
     assert (code, len(out.splitlines())) == (0, 3)
@@ -153,7 +149,7 @@ def test_an_open_tool_is_told_to_be_a_guess_and_its_unit_is_its_own(
     assert json.loads(run(*args)[1].splitlines()[0])["hits"] == 0
 
 
-def test_a_summary_without_json(run: Run, scene: Scene) -> None:
+def test_touch_text_summary(run: Run, scene: Scene) -> None:
     code, out, err = touch(run, scene)
     assert (code, err) == (0, "")
     assert re.search(r"frames\s+3: 2 hit, 2 in contact", out)
@@ -170,13 +166,11 @@ def test_a_summary_without_json(run: Run, scene: Scene) -> None:
         ("--tool none.stl", "none.stl"), ("--poses none.csv", "none.csv"),
     ],
 )  # fmt: skip
-def test_a_touch_that_cannot_be_is_one_line(
-    run: Run, scene: Scene, options: str, word: str
-) -> None:
+def test_touch_bad_arguments(run: Run, scene: Scene, options: str, word: str) -> None:
     refused(touch(run, scene, *options.split()), word)
 
 
-def test_a_few_poses_are_touched_without_measuring_costs_first(run: Run, scene: Path) -> None:
+def test_touch_uncalibrated_costs_use_array(run: Run, scene: Path) -> None:
     args = ("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", "--json")
     used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}
     assert used == {"array"}
@@ -191,9 +185,7 @@ UNWANTED = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 SPITEFUL = ("bell\x07\x1b[2J\x1b]0;owned", "gnp.\u202eexe", "\x9b31mred", "isolated\u2066\u2069")
 
 
-def test_no_name_from_elsewhere_moves_the_cursor_or_turns_the_writing(
-    run: Run, tmp_path: Path
-) -> None:
+def test_main_escapes_control_characters_in_names(run: Run, tmp_path: Path) -> None:
     """Names of parts in files and databases, and of files, in results and in errors."""
     lines = []
     for n, name in enumerate(SPITEFUL):

@@ -78,7 +78,7 @@ class DistancesContract(StoreCase):
             found |= _content_of(self.rows(store, object_id), object_id)
         return dict(sorted(found.items()))
 
-    def test_scans_return_distances_and_occupancy_as_written(self, band: Store) -> None:
+    def test_scan_distances_as_written(self, band: Store) -> None:
         everything = self.expected(band, 1, 3)
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == everything
         assert any(not any(brick) for brick, _ in everything.values())
@@ -90,20 +90,20 @@ class DistancesContract(StoreCase):
             place: row for place, row in everything.items() if any(place[0] in r for r in inside)
         }
 
-    def test_lookups_return_distances_of_the_keys_alone(self, band: Store) -> None:
+    def test_lookup_distances_of_given_keys(self, band: Store) -> None:
         everything = self.expected(band, 1, 3)
         keys = np.arange(0, max(key for key, _ in everything) + 3, dtype=np.int64)[::3].copy()
         wanted = {place: row for place, row in everything.items() if place[0] % 3 == 0}
         assert _content_of(band.lookup(keys, distances=True)) == wanted
         assert _content_of(band.lookup_each(keys, distances=True)) == wanted
 
-    def test_rows_of_one_object_have_its_distances(self, band: Store) -> None:
+    def test_rows_of_distances_of_one_object(self, band: Store) -> None:
         for object_id in (1, 3):
             rows = band.rows_of(object_id, *EVERYWHERE, distances=True)
             assert _content_of(rows) == self.expected(band, object_id)
         assert _content_of(band.rows_of(2, *EVERYWHERE, distances=True)) == {}
 
-    def test_without_distances_reads_are_those_of_the_index_table(self, band: Store) -> None:
+    def test_scan_without_distances(self, band: Store) -> None:
         parts = [self.rows(band, object_id).occupied() for object_id in PLACES]
         keys = np.sort(np.concatenate([part.keys for part in parts]))
         rows = band.scan(*EVERYWHERE)
@@ -114,7 +114,7 @@ class DistancesContract(StoreCase):
         np.testing.assert_array_equal(own.occupancy, parts[0].occupancy)
         assert band.lookup(np.unique(keys)).distances is None
 
-    def test_rows_are_counted_whether_their_bricks_hold_voxels_or_not(self, band: Store) -> None:
+    def test_count_includes_bricks_without_voxels(self, band: Store) -> None:
         n_rows = sum(len(self.rows(band, object_id)) for object_id in PLACES)
         assert band.count(*EVERYWHERE) == band.size().rows == band.quantiles(7).n_rows == n_rows
         assert n_rows > len(band.scan(*EVERYWHERE))
@@ -122,7 +122,7 @@ class DistancesContract(StoreCase):
         band.remove(3)
         assert band.count(*EVERYWHERE) == len(band.scan(*EVERYWHERE)) == len(self.rows(band, 2))
 
-    def test_figure_3_finds_the_voxels_alone(self, band: Store) -> None:
+    def test_statement_hits_ignore_distance_rows(self, band: Store) -> None:
         """At voxels of a box around the objects, where most bricks of an object hold none."""
         box = np.argwhere(np.ones((36, 32, 32))) + np.array([4, 8, 8])
         voxels = np.random.default_rng(0).choice(box, 800, replace=False)
@@ -140,7 +140,7 @@ class DistancesContract(StoreCase):
             if tuple(voxel) in asked
         }
 
-    def test_nothing_asked_has_no_distances(self, band: Store) -> None:
+    def test_lookup_scan_no_keys_no_distances(self, band: Store) -> None:
         for empty in (
             band.lookup(NO_KEYS, distances=True),
             band.lookup_each(NO_KEYS, distances=True),
@@ -149,7 +149,7 @@ class DistancesContract(StoreCase):
         ):
             assert _content_of(empty) == {}
 
-    def test_objects_say_whether_they_have_distances(self, band: Store) -> None:
+    def test_objects_has_distances(self, band: Store) -> None:
         assert [obj.has_distances for obj in band.objects()] == [True, False, True]
         for obj in band.objects():
             rows = self.rows(band, obj.id)
@@ -157,14 +157,14 @@ class DistancesContract(StoreCase):
             assert obj.rows_crc == parsing.rows_crc(rows.occupied())
             assert obj.attributes == {"made": True}
 
-    def test_a_refused_write_leaves_no_distances(self, band: Store) -> None:
+    def test_write_refused_leaves_no_distances(self, band: Store) -> None:
         before = _content_of(band.scan(*EVERYWHERE, distances=True))
         with pytest.raises(EnvironmentExistsError):
             self.write(band, 3, name="1")
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == before
         assert band.revision() == 3
 
-    def test_distances_go_with_their_object(self, band: Store) -> None:
+    def test_remove_deletes_distances(self, band: Store) -> None:
         band.remove(1)
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
         band.remove(2)
@@ -173,7 +173,7 @@ class DistancesContract(StoreCase):
             if change.id != 2:
                 assert _is_touched(change, self.rows(band, change.id).keys)
 
-    def test_replacing_gives_distances_and_takes_them(self, band: Store) -> None:
+    def test_replace_adds_and_removes_distances(self, band: Store) -> None:
         known, rows = band.object(1), self.rows(band, 1)
         voxels = band.rows_of(1, *EVERYWHERE)
         for new in (rows.occupied(), rows):
@@ -186,7 +186,7 @@ class DistancesContract(StoreCase):
                 np.testing.assert_array_equal(found, column)
             assert _is_touched(list(band.changes())[-1], rows.keys)
 
-    def test_all_rows_are_read_in_pieces_for_check(self, band: Store) -> None:
+    def test_all_rows_pieces_with_distances(self, band: Store) -> None:
         found, measured = {}, {}
         for rows in all_rows(band, 7):
             assert len(rows) <= 7

@@ -11,9 +11,7 @@ from voxels import EVERYWHERE, blob, kind
 
 
 class ReadingContract(StoreCase):
-    def test_lookup_finds_every_row_of_a_key_and_no_other(
-        self, store: Store, plain: dict[int, set[int]]
-    ) -> None:
+    def test_lookup_all_rows_of_keys(self, store: Store, plain: dict[int, set[int]]) -> None:
         spread = np.linspace(0, max(plain) + 3, 20_000, dtype=np.int64)
         known = np.array(sorted(plain), dtype=np.int64)[::3]
         keys = np.unique(np.concatenate([spread, known, known + 1]))
@@ -22,9 +20,7 @@ class ReadingContract(StoreCase):
             expected = [(k, i) for k in asked.tolist() for i in sorted(plain.get(k, ()))]
             assert sorted(zip(rows.keys.tolist(), rows.ids.tolist(), strict=True)) == expected
 
-    def test_scan_reads_closed_ranges_in_order(
-        self, store: Store, plain: dict[int, set[int]]
-    ) -> None:
+    def test_scan_closed_ranges_in_order(self, store: Store, plain: dict[int, set[int]]) -> None:
         known = sorted(plain)
         cuts = np.array(known, dtype=np.int64)
         lows, highs = cuts[::5].copy(), cuts[2::5].copy()
@@ -41,7 +37,7 @@ class ReadingContract(StoreCase):
         assert sorted(zip(rows.keys.tolist(), rows.ids.tolist(), strict=True)) == sorted(expected)
         assert store.count(lows, highs) == len(expected)
 
-    def test_occupancy_returns_as_written(self, store: Store) -> None:
+    def test_scan_occupancy_as_written(self, store: Store) -> None:
         if store.layout == "voxel":
             assert not store.lookup(np.zeros(1, dtype=np.int64)).occupancy.size
             return
@@ -50,12 +46,12 @@ class ReadingContract(StoreCase):
         mine = rows.occupancy.reshape(-1, 64)[rows.ids == 1]
         np.testing.assert_array_equal(mine, written.occupancy.reshape(-1, 64))
 
-    def test_nothing_asked_is_nothing_found(self, store: Store) -> None:
+    def test_lookup_scan_no_keys_empty(self, store: Store) -> None:
         none = np.empty(0, dtype=np.int64)
         assert len(store.lookup(none)) == len(store.scan(none, none)) == 0
         assert len(store.lookup_each(none)) == store.count(none, none) == 0
 
-    def test_rows_of_leaves_the_others_out(self, store: Store) -> None:
+    def test_rows_of_one_object(self, store: Store) -> None:
         written = rows_of_voxels(blob(2, (24, 20, 20)), *kind(store))
         rows = store.rows_of(2, *EVERYWHERE)
         np.testing.assert_array_equal(rows.keys, written.keys)
@@ -63,7 +59,7 @@ class ReadingContract(StoreCase):
         assert set(rows.ids.tolist()) == {2}
         assert not len(store.rows_of(3, *EVERYWHERE))
 
-    def test_an_empty_environment_answers(self) -> None:
+    def test_store_empty_environment(self) -> None:
         store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")
         assert store.revision() == store.size().rows == len(store.objects()) == 0
         assert not list(store.changes())
@@ -71,7 +67,7 @@ class ReadingContract(StoreCase):
         store.discard()
 
     @pytest.mark.parametrize("resolution", [1, 3, 7, 100, 5000])
-    def test_quantiles_follow_definition_2(self, store: Store, resolution: int) -> None:
+    def test_quantiles_definition_2(self, store: Store, resolution: int) -> None:
         """Bound i is the key of rank ceil(i N / v) among all rows, ties counted one by one."""
         rows = store.scan(*EVERYWHERE)
         keys = np.sort(rows.keys)
@@ -80,7 +76,7 @@ class ReadingContract(StoreCase):
         assert n_rows == len(keys)
         assert bounds.tolist() == [int(keys[rank - 1]) for rank in ranks]
 
-    def test_kept_quantiles_are_never_stale(self, store: Store) -> None:
+    def test_quantiles_stored_never_stale(self, store: Store) -> None:
         store.analyze(10)
         kept = store.quantiles(10)
         assert kept.source == "kept"
@@ -89,7 +85,7 @@ class ReadingContract(StoreCase):
         assert anew.source == "computed"
         assert anew.n_rows < kept.n_rows
 
-    def test_freshness_counts_the_writes_since(self, store: Store) -> None:
+    def test_freshness_counts_writes(self, store: Store) -> None:
         assert store.freshness(10).revision is None
         store.analyze(10)
         assert store.freshness(10) == (2, 0)
@@ -99,13 +95,13 @@ class ReadingContract(StoreCase):
         assert store.freshness(10) == (3, 0)
 
     @one_kind
-    def test_costs_are_kept_by_machine(self, store: Store) -> None:
+    def test_costs_by_machine(self, store: Store) -> None:
         assert store.costs("here") is None
         store.save_costs("here", {"row": 0.25, "row.spread": 0.5})
         assert store.costs("here") == {"row": 0.25, "row.spread": 0.5}
         assert store.costs("there") is None
 
-    def test_figure_3_finds_the_hits_and_leaves_out_the_excluded(self, store: Store) -> None:
+    def test_statement_hits_and_exclusions(self, store: Store) -> None:
         both = np.array([[22, 20, 20], [16, 20, 20], [60, 60, 60]], dtype=np.int64)
         keys = store.grid.encode(both)
         if store.layout == "brick":

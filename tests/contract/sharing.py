@@ -16,7 +16,7 @@ from voxels import EVERYWHERE, blob, is_noticed, kind, write_voxels
 
 class SharingContract(StoreCase):
     @one_kind
-    def test_a_snapshot_sees_one_revision(self, store: Store) -> None:
+    def test_snapshot_one_revision(self, store: Store) -> None:
         reader = self.reopen(store)
         before = reader.size().rows
         with reader.snapshot():
@@ -30,7 +30,7 @@ class SharingContract(StoreCase):
         reader.close()
 
     @one_kind
-    def test_a_store_belongs_to_the_thread_that_opened_it(self, store: Store) -> None:
+    def test_store_other_thread_refused(self, store: Store) -> None:
         with (
             ThreadPoolExecutor(1) as thread,
             pytest.raises(UsageError, match="belongs to the thread that opened it"),
@@ -39,13 +39,13 @@ class SharingContract(StoreCase):
         assert len(store.objects()) == 2
 
     @one_kind
-    def test_a_closed_store_says_so(self, store: Store) -> None:
+    def test_store_closed(self, store: Store) -> None:
         store.close()
         with pytest.raises(DatabaseError):
             store.objects()
 
     @one_kind
-    def test_a_store_opened_to_read_refuses_to_write(self, store: Store) -> None:
+    def test_store_read_only_refuses_writes(self, store: Store) -> None:
         reader = self.reopen(store)
         writes: list[Callable[[], object]] = [
             lambda: write_voxels(reader, blob(3, (20, 20, 20)), "three"),
@@ -60,7 +60,7 @@ class SharingContract(StoreCase):
         reader.close()
 
     @one_kind
-    def test_a_commit_of_another_is_noticed_once(self, store: Store) -> None:
+    def test_has_changed_once_per_commit(self, store: Store) -> None:
         reader = self.reopen(store)
         reader.watch()
         assert not reader.has_changed()
@@ -79,7 +79,7 @@ class SharingContract(StoreCase):
         reader.close()
 
     @one_kind
-    def test_none_of_many_commits_is_missed(self, store: Store) -> None:
+    def test_has_changed_no_commit_missed(self, store: Store) -> None:
         reader = self.reopen(store)
         voxel = np.array([[1, 2, 3]])
         for n in range(30):
@@ -94,7 +94,7 @@ class SharingContract(StoreCase):
         reader.close()
 
     @one_kind
-    def test_reading_neither_hides_a_commit_nor_invents_one(self, store: Store) -> None:
+    def test_has_changed_independent_of_reads(self, store: Store) -> None:
         reader = self.reopen(store)
         reader.watch()
         for _ in range(3):
@@ -108,7 +108,7 @@ class SharingContract(StoreCase):
         reader.close()
 
     @one_kind
-    def test_a_commit_during_a_snapshot_is_noticed_after_it(self, store: Store) -> None:
+    def test_has_changed_after_snapshot(self, store: Store) -> None:
         """Inside the snapshot `has_changed` is refused, because no commit is visible there."""
         reader = self.reopen(store)
         reader.watch()

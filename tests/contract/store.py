@@ -16,7 +16,7 @@ GRID = Grid(0.01, (0, 0, 0), 6)
 
 
 class UrlContract(Case):
-    def test_what_was_made_is_opened(self) -> None:
+    def test_open_store_as_created(self) -> None:
         url = self.new_url()
         assert not exists(url)
         with pytest.raises(EnvironmentNotFoundError):
@@ -30,7 +30,7 @@ class UrlContract(Case):
             assert store.is_read_only == read_only
             store.close()
 
-    def test_nothing_is_made_twice(self) -> None:
+    def test_create_store_existing(self) -> None:
         url = self.new_url()
         store = create_store(url, GRID)
         write_voxels(store, floor_voxels(GRID), "floor")
@@ -39,7 +39,7 @@ class UrlContract(Case):
         assert [obj.name for obj in store.objects()] == ["floor"]
         store.close()
 
-    def test_another_environment_stands_beside(self) -> None:
+    def test_create_store_beside_another(self) -> None:
         url = self.new_url()
         other = self.new_url()
         first = create_store(url, GRID)

@@ -39,7 +39,7 @@ def made_up(store: Store) -> set[str]:
 
 class WritingContract(StoreCase):
     @one_kind
-    def test_objects_return_as_written(self, store: Store) -> None:
+    def test_objects_as_written(self, store: Store) -> None:
         first, second = store.objects()
         assert (first.id, second.id) == (1, 2)
         assert store.object(2).name == "two"
@@ -53,7 +53,7 @@ class WritingContract(StoreCase):
         )
 
     @one_kind
-    def test_some_objects_and_outlines_are_those_of_all(self, store: Store) -> None:
+    def test_objects_and_outlines_of_some_ids(self, store: Store) -> None:
         objects = store.objects()
         assert [obj.name for obj in store.objects([7, 2])] == ["two"]
         assert store.objects([]) == []
@@ -66,14 +66,14 @@ class WritingContract(StoreCase):
         none = self.make(*kind(store)).outlines()
         assert (len(none.names), none.ids.shape, none.bounds.shape) == (0, (0,), (0, 2, 3))
 
-    def test_the_same_part_is_not_written_twice(self, store: Store) -> None:
+    def test_write_duplicate_part_refused(self, store: Store) -> None:
         before = store.size().rows
         with pytest.raises(EnvironmentExistsError):
             write_voxels(store, blob(5, (40, 40, 40)), "one")
         assert store.size().rows == before
         assert store.revision() == 2
 
-    def test_loading_ends_as_single_writes_do(self, store: Store) -> None:
+    def test_loading_equals_single_writes(self, store: Store) -> None:
         fresh = self.make(*kind(store))
         with contextlib.suppress(ZeroDivisionError), fresh.loading(), fresh.loading():
             write_voxels(fresh, blob(1, (20, 20, 20)), "one")
@@ -84,7 +84,7 @@ class WritingContract(StoreCase):
         assert [obj.id for obj in fresh.objects()] == [1, 2]
         assert fresh.revision() == 2
 
-    def test_an_id_is_kept_where_it_is_free(self, store: Store) -> None:
+    def test_add_assigns_free_id(self, store: Store) -> None:
         ijk = blob(5, (40, 40, 40))
         rows = rows_of_voxels(ijk, *kind(store))
         nine = replace(voxel_object(store.grid, ijk, "nine"), id=9)
@@ -92,7 +92,7 @@ class WritingContract(StoreCase):
         assert store.add(replace(nine, name="again"), rows) == 10
         assert write_voxels(store, ijk, "next") == 11
 
-    def test_an_object_written_meanwhile_is_not_replaced(self, store: Store) -> None:
+    def test_replace_stale_record_conflict(self, store: Store) -> None:
         rows = rows_of_voxels(blob(7, (44, 30, 10)), *kind(store))
         seen = store.object(1)
         store.replace(seen, rows)
@@ -102,7 +102,7 @@ class WritingContract(StoreCase):
         with pytest.raises(ObjectNotFoundError):
             store.replace(replace(seen, id=7), rows)
 
-    def test_remove_takes_one_object_and_leaves_the_others(self, store: Store) -> None:
+    def test_remove_one_object(self, store: Store) -> None:
         store.remove(1)
         assert [obj.id for obj in store.objects()] == [2]
         rows = store.scan(*EVERYWHERE)
@@ -114,7 +114,7 @@ class WritingContract(StoreCase):
             store.remove(2)
 
     @one_kind
-    def test_removed_parts_are_known_until_they_are_there_again(self, store: Store) -> None:
+    def test_removed_parts_until_added_again(self, store: Store) -> None:
         link = store.object(1).link
         assert store.removed(link) == set()
         store.remove(1)
@@ -124,7 +124,7 @@ class WritingContract(StoreCase):
         write_voxels(store, blob(1, (20, 20, 20)), "one")
         assert store.removed(link) == {"two"}
 
-    def test_replace_moves_the_rows(self, store: Store) -> None:
+    def test_replace_moves_rows(self, store: Store) -> None:
         ijk = blob(7, (44, 30, 10))
         new = voxel_object(store.grid, ijk, "one")
         moved = Object(**{**vars(new), "id": 1})
@@ -144,7 +144,7 @@ class WritingContract(StoreCase):
                 rows_of_voxels(ijk, *kind(store)),
             )
 
-    def test_several_objects_are_replaced_in_one_transaction(self, store: Store) -> None:
+    def test_replace_all_one_transaction(self, store: Store) -> None:
         reader, seen = self.reopen(store), []
 
         def made() -> Iterator[tuple[Object, Rows]]:
@@ -163,7 +163,7 @@ class WritingContract(StoreCase):
         reader.close()
 
     @pytest.mark.parametrize("k", [0, 1, 2])
-    def test_a_move_of_several_that_fails_leaves_none_moved(self, store: Store, k: int) -> None:
+    def test_replace_all_failure_rolls_back(self, store: Store, k: int) -> None:
         before = store.scan(*EVERYWHERE)
 
         def made() -> Iterator[tuple[Object, Rows]]:
@@ -178,7 +178,7 @@ class WritingContract(StoreCase):
         assert [obj.revision for obj in store.objects()] == [1, 2]
         assert (store.revision(), len(list(store.changes()))) == (2, 2)
 
-    def test_changes_name_the_keys_touched(self, store: Store) -> None:
+    def test_changes_touched_keys(self, store: Store) -> None:
         changes = list(store.changes())
         assert [(c.revision, c.action, c.id) for c in changes] == [(1, "add", 1), (2, "add", 2)]
         keys = store.grid.encode(blob(2, (24, 20, 20)))
@@ -202,7 +202,7 @@ class WritingContract(StoreCase):
         return store
 
     @one_kind
-    def test_a_shape_is_written_once_however_many_objects_have_it(self, shapes: Store) -> None:
+    def test_surfaces_shared_shape_written_once(self, shapes: Store) -> None:
         assert shapes.surfaces(["ball", "cone", "nothing"]) == {"ball": BALL, "cone": CONE}
         assert shapes.surfaces(["cone"]) == {"cone": CONE}
         assert shapes.surfaces([]) == {}
@@ -212,14 +212,14 @@ class WritingContract(StoreCase):
         assert (size.surfaces, size.surface_bytes) == (4, sum(map(len, held.values())))
 
     @one_kind
-    def test_a_move_leaves_the_surface(self, shapes: Store) -> None:
+    def test_surfaces_unchanged_by_move(self, shapes: Store) -> None:
         for object_id, name in ((3, "three"), (5, "five")):
             record, rows = self.part(shapes, shapes.object(object_id).digest, name)
             shapes.replace(replace(record, id=object_id), rows)
         assert shapes.surfaces(["ball", "cone"]) == {"ball": BALL, "cone": CONE}
 
     @one_kind
-    def test_a_surface_goes_with_the_last_object_that_has_it(self, shapes: Store) -> None:
+    def test_surfaces_deleted_with_last_object(self, shapes: Store) -> None:
         shapes.remove(3)
         assert made_up(shapes) == {"ball", "cone"}
         record, rows = self.part(shapes, "cube", "four")
@@ -231,13 +231,13 @@ class WritingContract(StoreCase):
         assert shapes.surfaces(["ball"]) == {"ball": BALL}
 
     @one_kind
-    def test_a_refused_write_leaves_no_surface(self, shapes: Store) -> None:
+    def test_surfaces_refused_write_leaves_none(self, shapes: Store) -> None:
         with pytest.raises(EnvironmentExistsError):
             shapes.add(*self.part(shapes, "cube", "five"), b"cube")
         assert made_up(shapes) == {"ball", "cone"}
 
     @one_kind
-    def test_a_snapshot_keeps_a_surface_that_goes(self, shapes: Store) -> None:
+    def test_surfaces_snapshot_isolation(self, shapes: Store) -> None:
         reader = self.reopen(shapes)
         with reader.snapshot():
             assert reader.object(5).digest == "cone"
@@ -247,7 +247,7 @@ class WritingContract(StoreCase):
         reader.close()
 
     @one_kind
-    def test_rows_come_back_in_order(self, store: Store) -> None:
+    def test_pairs_in_order(self, store: Store) -> None:
         revision = store.revision()
         assert list(store.pairs()) == []
         store.put_pairs([SECOND, FIRST])
@@ -260,13 +260,13 @@ class WritingContract(StoreCase):
         assert store.revision() == revision
 
     @one_kind
-    def test_a_later_revision_stays(self, store: Store) -> None:
+    def test_put_pairs_later_revision_wins(self, store: Store) -> None:
         store.put_pairs([FIRST])
         store.put_pairs([FIRST._replace(kind=Kind.TOUCHING, revision=1)])
         assert list(store.pairs()) == [FIRST]
 
     @one_kind
-    def test_the_mark_is_that_of_who_wrote_last(self, store: Store) -> None:
+    def test_put_pairs_mark_of_last_writer(self, store: Store) -> None:
         assert store.pairs().mark == Mark()
         mine = store.put_pairs([FIRST], was=Mark())
         assert mine is not None
@@ -284,7 +284,7 @@ class WritingContract(StoreCase):
         assert [[row[:2] for row in part] for part in kept.parted({3})] == [[(1, 3)], [(1, 2)]]
 
     @one_kind
-    def test_an_acceptance_outlasts_a_new_measurement(self, store: Store) -> None:
+    def test_accept_pair_outlasts_new_measurement(self, store: Store) -> None:
         store.put_pairs([FIRST])
         store.accept_pair(1, 2, "a press fit", "ball cone")
         store.accept_pair(4, 5, "nothing", "at all")
@@ -295,7 +295,7 @@ class WritingContract(StoreCase):
         assert list(store.pairs()) == [FIRST._replace(at_least=0.2)]
 
     @one_kind
-    def test_a_snapshot_keeps_the_pairs_that_it_sees(self, store: Store) -> None:
+    def test_pairs_snapshot_isolation(self, store: Store) -> None:
         store.put_pairs([FIRST])
         reader = self.reopen(store)
         with reader.snapshot():
@@ -306,7 +306,7 @@ class WritingContract(StoreCase):
         reader.close()
 
     @one_kind
-    def test_rules_come_back_in_order_and_are_replaced_together(self, store: Store) -> None:
+    def test_change_rules_order_and_replacement(self, store: Store) -> None:
         revision = store.revision()
         assert store.rules() == ()
         meant = Rule(

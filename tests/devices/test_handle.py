@@ -34,7 +34,7 @@ def pose(hand: Hand) -> Floats:
 
 @few
 @given(SEEDS)
-def test_without_scale_and_clutch_the_handle_is_where_the_hand_is_exactly(seed: int) -> None:
+def test_handle_identity_follows_hand_exactly(seed: int) -> None:
     rng = np.random.default_rng(seed)
     handle, hand = Handle(), np.zeros((), HAND)
     handle.start(reading(rng), hand)
@@ -48,7 +48,7 @@ def test_without_scale_and_clutch_the_handle_is_where_the_hand_is_exactly(seed: 
 
 @few
 @given(SEEDS, SCALES)
-def test_positions_and_speeds_are_scaled_and_turns_are_not(seed: int, scale: float) -> None:
+def test_handle_scales_positions_not_rotations(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     handle, hand = Handle(scale=scale), np.zeros((), HAND)
     handle.start(reading(rng), hand)
@@ -62,7 +62,7 @@ def test_positions_and_speeds_are_scaled_and_turns_are_not(seed: int, scale: flo
 
 @few
 @given(SEEDS, SCALES)
-def test_nothing_jumps_when_the_clutch_opens_and_closes(seed: int, scale: float) -> None:
+def test_handle_clutch_continuous(seed: int, scale: float) -> None:
     """Nothing jumps, however far the hand moved and turned while the clutch was open."""
     rng = np.random.default_rng(seed)
     handle, hand = Handle(scale=scale, clutch=1), np.zeros((), HAND)
@@ -85,7 +85,7 @@ def test_nothing_jumps_when_the_clutch_opens_and_closes(seed: int, scale: float)
 
 @few
 @given(SEEDS, SCALES)
-def test_after_the_clutch_the_handle_moves_as_the_hand_does(seed: int, scale: float) -> None:
+def test_handle_after_clutch_follows_scaled_motion(seed: int, scale: float) -> None:
     """The handle moves by the scaled way and the same turn, in the world's axes."""
     rng = np.random.default_rng(seed)
     handle, hand = Handle(scale=scale, clutch=0), np.zeros((), HAND)
@@ -105,7 +105,7 @@ def test_after_the_clutch_the_handle_moves_as_the_hand_does(seed: int, scale: fl
 
 @few
 @given(SEEDS, SCALES)
-def test_a_handle_starts_where_it_is_told_to(seed: int, scale: float) -> None:
+def test_handle_given_start_pose(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     start = turned(rng, rng.uniform(-1, 1, 3))
     handle, hand = Handle(scale=scale, start=start), np.zeros((), HAND)
@@ -129,9 +129,7 @@ def lost(rng: np.random.Generator, bad: float, at: int, buttons: int = 0) -> Rea
 
 @few
 @given(SEEDS, SCALES, st.sampled_from([math.nan, math.inf]), st.integers(0, 17))
-def test_after_readings_that_are_not_finite_all_is_as_if_they_had_not_been(
-    seed: int, scale: float, bad: float, at: int
-) -> None:
+def test_handle_ignores_non_finite_readings(seed: int, scale: float, bad: float, at: int) -> None:
     """Such readings have no effect, also while the clutch is open and when it closes."""
     rng = np.random.default_rng(seed)
     handles = [Handle(scale=scale, clutch=0) for _ in range(2)]
@@ -156,9 +154,7 @@ def test_after_readings_that_are_not_finite_all_is_as_if_they_had_not_been(
 
 @few
 @given(SEEDS, st.integers(0, 17), st.booleans())
-def test_a_handle_that_starts_nowhere_starts_with_the_first_finite_reading(
-    seed: int, at: int, is_placed: bool
-) -> None:
+def test_handle_starts_at_first_finite_reading(seed: int, at: int, is_placed: bool) -> None:
     rng = np.random.default_rng(seed)
     start = turned(rng, rng.uniform(-1, 1, 3)) if is_placed else None
     handle, hand = Handle(start=start), np.zeros((), HAND)
@@ -182,6 +178,6 @@ def test_a_handle_that_starts_nowhere_starts_with_the_first_finite_reading(
         ({"start": 2.0 * np.eye(4)}, "rigid"),
     ],
 )
-def test_what_makes_no_sense_is_refused(wrong: dict[str, Any], message: str) -> None:
+def test_handle_bad_options(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         Handle(**wrong)

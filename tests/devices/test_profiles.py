@@ -39,14 +39,14 @@ profiles = st.builds(
 )
 
 
-def test_a_profile_is_found_by_its_name_however_it_is_written() -> None:
+def test_profile_named_any_spelling() -> None:
     assert profile_named("Premium 1.5") is PROFILES["premium-1.5"]
     assert profile_named("OMEGA") is PROFILES["omega"]
     with pytest.raises(UsageError, match=r"no device profile 'omeag': give touch, omni, .*sigma"):
         profile_named("omeag")
 
 
-def test_every_device_of_ours_has_a_profile_before_it_is_opened() -> None:
+def test_profile_of_unopened_devices() -> None:
     assert profile_of(RandomHand((0, 0, 0))) is SCRIPTED
     assert profile_of(OpenHapticsDevice()) == PROFILES["touch"]
     assert profile_of(OpenHapticsDevice(profile=PROFILES["desktop"])).cap == 7.9
@@ -59,7 +59,7 @@ def test_every_device_of_ours_has_a_profile_before_it_is_opened() -> None:
         profile_of(SimpleNamespace(profile="omega"))
 
 
-def test_a_simulated_device_states_its_caps_its_delay_and_its_hand() -> None:
+def test_profile_of_simulated_device() -> None:
     hand = RandomHand((0, 0, 0))
     device = SimulatedDevice(hand, mass=0.2, grip=450.0, max_force=5.0, latency=0.002)
     profile = profile_of(device)
@@ -69,7 +69,7 @@ def test_a_simulated_device_states_its_caps_its_delay_and_its_hand() -> None:
     assert profile_of(SimulatedDevice(hand, max_force=0.0)).cap > 0.0
 
 
-def test_a_number_that_no_device_has_is_refused() -> None:
+def test_device_profile_bad_numbers() -> None:
     wrong: dict[str, Any] = {"cap": 0, "turn_stiffness": math.nan, "damping": math.inf, "delay": -1}
     for field, value in wrong.items():
         with pytest.raises(UsageError, match=f"profile desktop: {field} "):
@@ -82,7 +82,7 @@ def test_a_number_that_no_device_has_is_refused() -> None:
 # -- the rule -------------------------------------------------------------------------------------
 
 
-def test_the_rule_is_that_of_its_source() -> None:
+def test_stable_stiffness_closed_form() -> None:
     """0.4 (b + 0.6 sqrt(100 m)) / (T/2 + t_d), by hand."""
     profile = DeviceProfile("mine", 10.0, 1e5, 5.0, mass=0.09, own_damping=0.2)
     # 0.6 sqrt(9) = 1.8; (0.2 + 1.8) * 0.4 = 0.8; at 1 kHz and 1 ms: 0.8 / 1.5 ms
@@ -91,7 +91,7 @@ def test_the_rule_is_that_of_its_source() -> None:
     assert stability.hand_damping(profile) == pytest.approx(1.8)
 
 
-def test_a_stiffness_that_is_too_great_is_lowered_with_one_line_that_says_by_what() -> None:
+def test_limit_stiffness_message() -> None:
     desktop = PROFILES["desktop"]
     found = stability.limit_stiffness(desktop, 1000.0, 3000.0, 1e-3)
     assert found.stiffness == pytest.approx(0.4 * 0.6 * math.sqrt(4.5) / 1.5e-3)
@@ -102,13 +102,13 @@ def test_a_stiffness_that_is_too_great_is_lowered_with_one_line_that_says_by_wha
     assert "0.045 kg assumed" in str(stability.limit_stiffness(PROFILES["omega"], 500.0).lowered)
 
 
-def test_a_hand_that_no_force_moves_takes_any_stiffness() -> None:
+def test_limit_stiffness_scripted_hand_unlimited() -> None:
     assert stability.limit_stiffness(SCRIPTED, 10.0).stiffness == 1000.0
     assert stability.limit_stiffness(SCRIPTED, 10.0, 1e5).stiffness == 1e5
 
 
 @given(profiles, RATES, DELAYS, st.floats(1.0, 1e5))
-def test_what_is_given_is_never_more_than_asked_rendered_or_stable(
+def test_limit_stiffness_upper_bounds(
     profile: DeviceProfile, rate: float, delay: float, asked: float
 ) -> None:
     found = stability.limit_stiffness(profile, rate, asked, delay)

@@ -106,7 +106,7 @@ class Rows:
         (None, r"None is none, it has no read and no apply"),
     ],
 )
-def test_what_is_no_device_is_refused_with_what_to_pass_instead(
+def test_session_rejects_non_device(
     sphere: PointShell,
     device: Any,  # noqa: ANN401 - that is the test
     hint: str,
@@ -118,7 +118,7 @@ def test_what_is_no_device_is_refused_with_what_to_pass_instead(
 
 
 @pytest.mark.parametrize(("change", "told"), FAULTS)
-def test_a_reading_of_the_wrong_kind_is_refused(change: Change, told: str) -> None:
+def test_reader_bad_reading_type(change: Change, told: str) -> None:
     hand = Odd(still(0.0), change, first=2)
     for reader in (Reader(hand), SimulatedDevice(hand)):
         hand.reads = 0
@@ -128,7 +128,7 @@ def test_a_reading_of_the_wrong_kind_is_refused(change: Change, told: str) -> No
 
 
 @pytest.mark.parametrize("change", FORMS)
-def test_a_reading_of_another_form_is_taken_as_it_is(change: Change) -> None:
+def test_reader_accepts_other_array_forms(change: Change) -> None:
     reader = Reader(Odd(still(0.015625), change))  # exact in single precision, too
     pose, velocity, buttons = reader.read()
     assert pose[:3, 3].tolist() == [0.0, 0.0, 0.015625]
@@ -138,13 +138,13 @@ def test_a_reading_of_another_form_is_taken_as_it_is(change: Change) -> None:
 
 
 @pytest.mark.parametrize(("change", "told"), MOMENTS)
-def test_a_reading_that_is_no_place_is_told(change: Change, told: str) -> None:
+def test_reader_fault_invalid_pose(change: Change, told: str) -> None:
     reader = Reader(Odd(still(0.01), change))
     reader.read()
     assert re.match(rf"Odd\.read\(\) returned {told}; expected ", reader.fault())
 
 
-def test_a_simulated_device_goes_on_when_its_hand_is_somewhere_again() -> None:
+def test_simulated_device_resumes_after_invalid_hand() -> None:
     nowhere = Odd(still(0.25), lambda r: r._replace(velocity=np.full(6, np.nan)), 5, 5)
     device = SimulatedDevice(nowhere)
     told = [Reader(device).read() for _ in range(12)]

@@ -69,7 +69,7 @@ def read_at(device: Device, clock: SetClock, seconds: float) -> Reading:
 @pytest.mark.parametrize("name", MAKERS)
 @given(instant=st.floats(0.01, 40.0))
 @settings(max_examples=10, deadline=None)
-def test_poses_are_rigid_and_velocities_are_what_they_change_by(name: str, instant: float) -> None:
+def test_scripted_poses_rigid_and_velocities_match(name: str, instant: float) -> None:
     clock = SetClock(100.0)
     device = MAKERS[name](clock)
     device.read()
@@ -85,7 +85,7 @@ def test_poses_are_rigid_and_velocities_are_what_they_change_by(name: str, insta
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_device_goes_on_alike_in_another_process(name: str) -> None:
+def test_scripted_devices_pickle_state(name: str) -> None:
     clock = SetClock(100.0)
     device = MAKERS[name](clock)
     read_at(device, clock, 0.0)
@@ -98,7 +98,7 @@ def test_a_device_goes_on_alike_in_another_process(name: str) -> None:
         assert np.array_equal(ours.velocity, theirs.velocity)
 
 
-def test_a_script_starts_at_its_first_read() -> None:
+def test_player_starts_at_first_read() -> None:
     clock = SetClock(100.0)
     ends = np.tile(np.eye(4), (2, 1, 1))
     ends[:, :3, 3] = (1.0, 2.0, 3.0), (2.0, 2.0, 3.0)
@@ -110,7 +110,7 @@ def test_a_script_starts_at_its_first_read() -> None:
     assert np.allclose(line.read().velocity, [0.5, 0, 0, 0, 0, 0])
 
 
-def test_a_path_that_is_over_rests_at_its_last_pose() -> None:
+def test_player_rests_at_last_pose() -> None:
     clock = SetClock(100.0)
     player = Player([3.0, 4.0, 5.0], [np.eye(4), TURNED, quarter(2)], clock=clock)
     assert not player.is_over
@@ -124,7 +124,7 @@ def test_a_path_that_is_over_rests_at_its_last_pose() -> None:
         assert last.velocity.tolist() == [0.0] * 6
 
 
-def test_turns_between_poses_are_even() -> None:
+def test_player_constant_angular_velocity() -> None:
     clock = SetClock(100.0)
     player = Player([0.0, 3.0], [np.eye(4), quarter(2)], clock=clock)
     player.read()
@@ -133,7 +133,7 @@ def test_turns_between_poses_are_even() -> None:
     assert np.allclose(third.velocity, [0, 0, 0, 0, 0, math.pi / 6])
 
 
-def test_a_path_that_loops_is_never_over() -> None:
+def test_player_loop_never_over() -> None:
     clock = SetClock(100.0)
     places = [pose_at((x, 0.0, 0.0)) for x in (0.0, 1.0, 0.0)]
     line = Player([0.0, 1.0, 2.0], places, loops=True, clock=clock)
@@ -146,7 +146,7 @@ def test_a_path_that_loops_is_never_over() -> None:
 
 @given(speed=st.floats(0.05, 2.0), seed=st.integers(0, 1000))
 @settings(max_examples=5, deadline=None)
-def test_a_random_hand_peaks_at_the_speed_asked_for(speed: float, seed: int) -> None:
+def test_random_hand_peak_speed(speed: float, seed: int) -> None:
     clock = SetClock(100.0)
     hand = RandomHand((1, 2, 3), seed, speed, 2.0 * speed, 0.3, clock=clock)
     start = kept(hand.read())
@@ -161,12 +161,12 @@ def test_a_random_hand_peaks_at_the_speed_asked_for(speed: float, seed: int) -> 
     assert np.allclose(readings[-1].pose, start.pose, atol=1e-9)
 
 
-def test_a_hand_that_would_have_to_shake_faster_than_hands_do_is_refused() -> None:
+def test_random_hand_unreachable_speed() -> None:
     with pytest.raises(UsageError, match=r"no hand reaches 5 m/s within 0.01 m"):
         RandomHand((0, 0, 0), speed=5.0, reach=0.01)
 
 
-def test_a_file_without_times_runs_at_a_speed(tmp_path: FilePath) -> None:
+def test_path_device_constant_speed(tmp_path: FilePath) -> None:
     clock = SetClock(100.0)
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[1:, 0, 3] = 0.1, 0.1, 0.3
@@ -178,7 +178,7 @@ def test_a_file_without_times_runs_at_a_speed(tmp_path: FilePath) -> None:
     assert Path(tmp_path / "p.csv", speed=0.6).duration == pytest.approx(0.5)
 
 
-def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
+def test_path_device_times_of_file(tmp_path: FilePath) -> None:
     file = tmp_path / "p.csv"
     file.write_text("x,y,z,qw,qx,qy,qz,t\n0,0,0,1,0,0,0,1\n1,0,0,1,0,0,0,2\n1,1,0,1,0,0,0,5\n")
     clock = SetClock(100.0)
@@ -189,7 +189,7 @@ def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
     assert Path(file, speed=1.0).duration == pytest.approx(2.0)
 
 
-def test_scripts_that_cannot_be_are_refused() -> None:
+def test_player_bad_times() -> None:
     makers: tuple[Callable[[], Device], ...] = (
         lambda: Player([0.0, 0.0], [np.eye(4)] * 2),
         lambda: Player([], np.empty((0, 4, 4))),
@@ -202,7 +202,7 @@ def test_scripts_that_cannot_be_are_refused() -> None:
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6))
-def test_caps_shorten_and_keep_the_direction(values: list[float]) -> None:
+def test_capped_keeps_direction(values: list[float]) -> None:
     wrench = np.array(values)
     given_before = wrench.copy()
     out = capped(wrench, 7.0, 0.2)
@@ -213,7 +213,7 @@ def test_caps_shorten_and_keep_the_direction(values: list[float]) -> None:
     assert np.array_equal(wrench, given_before)
 
 
-def test_what_is_not_finite_never_reaches_a_motor() -> None:
+def test_capped_non_finite_is_zero() -> None:
     for bad in (math.nan, math.inf, -math.inf):
         assert capped(np.array([bad, 1, 1, 0.1, 0, 0]), 7.0, 0.2).tolist() == [0, 0, 0, 0.1, 0, 0]
         assert capped(np.array([1, 0, 0, 0, 0, bad]), 7.0, 0.2).tolist() == [1, 0, 0, 0, 0, 0]

@@ -57,9 +57,7 @@ def energy(reading: Reading, hand: Still) -> float:
     ),
 )
 @settings(max_examples=8, deadline=None)
-def test_a_free_device_comes_to_the_hand_and_only_loses_energy(
-    position: list[float], q: list[float]
-) -> None:
+def test_simulated_device_dissipates_to_hand(position: list[float], q: list[float]) -> None:
     clock, hand = SetClock(), Still()
     device = SimulatedDevice(hand, clock=clock)
     device.read()
@@ -76,7 +74,7 @@ def test_a_free_device_comes_to_the_hand_and_only_loses_energy(
     assert np.allclose(rested.velocity, 0.0, atol=1e-4)
 
 
-def test_a_step_of_the_hand_is_followed_as_the_equation_says() -> None:
+def test_simulated_device_step_response_closed_form() -> None:
     clock, hand = SetClock(), Still()
     device = SimulatedDevice(hand, clock=clock)
     device.read()
@@ -89,7 +87,7 @@ def test_a_step_of_the_hand_is_followed_as_the_equation_says() -> None:
         assert x == pytest.approx(0.01 * (1.0 - (1.0 + w * t) * np.exp(-w * t)), abs=3e-5)
 
 
-def test_a_wrench_pushes_after_the_latency_and_not_before() -> None:
+def test_simulated_device_latency() -> None:
     clock, hand = SetClock(), Still()
     device = SimulatedDevice(hand, latency=0.005, clock=clock)
     device.read()
@@ -101,7 +99,7 @@ def test_a_wrench_pushes_after_the_latency_and_not_before() -> None:
     assert moved.velocity[5] == pytest.approx(0.05, rel=0.05)
 
 
-def test_wrenches_push_in_turn() -> None:
+def test_simulated_device_wrench_order() -> None:
     clock, hand = SetClock(), Still()
     device = SimulatedDevice(hand, latency=0.002, grip=0.0, clock=clock)
     device.read()
@@ -115,7 +113,7 @@ def test_wrenches_push_in_turn() -> None:
     assert reading.pose[0, 3] == pytest.approx(0.001**2 / 0.1, rel=1e-6)
 
 
-def test_the_motors_are_capped() -> None:
+def test_simulated_device_force_cap() -> None:
     clock, hand = SetClock(), Still()
     device = SimulatedDevice(hand, clock=clock)
     device.read()
@@ -125,7 +123,7 @@ def test_the_motors_are_capped() -> None:
     assert angle_between(np.eye(3), rested.pose[:3, :3]) == pytest.approx(0.2 / 0.3, abs=1e-4)
 
 
-def test_a_long_pause_is_skipped_but_for_its_end() -> None:
+def test_simulated_device_long_pause_skipped() -> None:
     clock, hand = SetClock(), Still()
     device = SimulatedDevice(hand, grip=0.0, latency=0.0, clock=clock)
     device.read()
@@ -135,7 +133,7 @@ def test_a_long_pause_is_skipped_but_for_its_end() -> None:
     assert device.read().velocity[0] == pytest.approx(0.5, rel=1e-3)
 
 
-def test_buttons_are_the_hand_s_and_a_hand_without_an_end_has_none() -> None:
+def test_simulated_device_buttons_and_end_of_hand() -> None:
     hand = Still()
     device = SimulatedDevice(hand)
     hand.buttons = 5
@@ -151,6 +149,6 @@ def test_buttons_are_the_hand_s_and_a_hand_without_an_end_has_none() -> None:
 @pytest.mark.parametrize(
     "wrong", [{"mass": 0.0}, {"grip": -1.0}, {"latency": float("nan")}, {"mass": 1e-6}]
 )
-def test_devices_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+def test_simulated_device_bad_parameters(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         SimulatedDevice(Still(), **wrong)

@@ -66,7 +66,7 @@ def opened(device: D) -> D:
         (HaplyDevice, "websockets", "websockets"),
     ],
 )
-def test_a_package_that_is_not_there_is_named_with_what_installs_it(
+def test_device_missing_package(
     monkeypatch: pytest.MonkeyPatch, make: Callable[[], SupportsOpen], package: str, wanted: str
 ) -> None:
     for name in [n for n in sys.modules if n.split(".")[0] == package]:
@@ -88,7 +88,7 @@ class Without:
             raise ModuleNotFoundError(f"No module named {name!r}", name=self.package)
 
 
-def test_a_maker_s_library_that_does_not_load_is_another_matter(
+def test_load_vendor_library_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def fail(name: str) -> ModuleType:
@@ -101,7 +101,7 @@ def test_a_maker_s_library_that_does_not_load_is_another_matter(
 
 
 @pytest.mark.parametrize("make", [ForceDimensionDevice, OpenHapticsDevice, HaplyDevice])
-def test_devices_travel_before_they_are_opened(make: Callable[[], Device]) -> None:
+def test_devices_pickle_before_open(make: Callable[[], Device]) -> None:
     device = make()
     assert isinstance(device, SupportsOpen)
     assert isinstance(device, SupportsClose)
@@ -110,7 +110,7 @@ def test_devices_travel_before_they_are_opened(make: Callable[[], Device]) -> No
         pickle.loads(pickle.dumps(device)).read()  # noqa: S301 - its own
 
 
-def test_velocity_is_the_difference_over_the_window() -> None:
+def test_velocity_window_difference() -> None:
     window = VelocityWindow()
     pose = np.eye(4)
     assert window.measure(5.0, pose.copy()).tolist() == [0.0] * 6
@@ -128,7 +128,7 @@ def test_velocity_is_the_difference_over_the_window() -> None:
 # --- Force Dimension ----------------------------------------------------------------------------
 
 
-def test_force_dimension_reports_pose_velocity_and_buttons(dhd: FakeDhd) -> None:
+def test_force_dimension_pose_velocity_buttons(dhd: FakeDhd) -> None:
     device = opened(ForceDimensionDevice())
     reading = device.read()
     assert reading.pose[:3, 3].tolist() == [0.01, 0.02, 0.03]
@@ -139,7 +139,7 @@ def test_force_dimension_reports_pose_velocity_and_buttons(dhd: FakeDhd) -> None
     assert dhd.calls[:2] == [("open",), ("enableForce", True, 0)]
 
 
-def test_force_dimension_is_capped_in_force_and_torque(dhd: FakeDhd) -> None:
+def test_force_dimension_caps(dhd: FakeDhd) -> None:
     device = opened(ForceDimensionDevice(4711))
     assert dhd.calls[0] == ("openSerial", 4711)
     device.apply(PUSH)
@@ -147,7 +147,7 @@ def test_force_dimension_is_capped_in_force_and_torque(dhd: FakeDhd) -> None:
     assert dhd.calls[-1] == ("setForceAndTorque", force, torque, 0)
 
 
-def test_force_dimension_without_a_wrist_is_upright_and_pushes_straight(dhd: FakeDhd) -> None:
+def test_force_dimension_without_wrist(dhd: FakeDhd) -> None:
     dhd.wrist = dhd.active_wrist = False
     device = opened(ForceDimensionDevice())
     reading = device.read()
@@ -158,7 +158,7 @@ def test_force_dimension_without_a_wrist_is_upright_and_pushes_straight(dhd: Fak
     assert dhd.calls[-1] == ("setForce", pytest.approx([4.2, 0.0, 5.6]), 0)
 
 
-def test_force_dimension_takes_no_speed_yet_and_saturated_motors_for_what_they_are(
+def test_force_dimension_tolerates_soft_error_codes(
     dhd: FakeDhd,
 ) -> None:
     dhd.velocity_code, dhd.push_code = -1, 2
@@ -168,7 +168,7 @@ def test_force_dimension_takes_no_speed_yet_and_saturated_motors_for_what_they_a
     assert dhd.calls[-1][0] == "setForceAndTorque"
 
 
-def test_force_dimension_that_is_not_there_is_told(dhd: FakeDhd) -> None:
+def test_force_dimension_missing_device(dhd: FakeDhd) -> None:
     dhd.n_devices = 0
     with pytest.raises(DeviceError, match="no device found"):
         ForceDimensionDevice().open()
@@ -176,7 +176,7 @@ def test_force_dimension_that_is_not_there_is_told(dhd: FakeDhd) -> None:
         ForceDimensionDevice(12).open()
 
 
-def test_force_dimension_that_is_unplugged_is_told(dhd: FakeDhd) -> None:
+def test_force_dimension_unplugged(dhd: FakeDhd) -> None:
     device = opened(ForceDimensionDevice())
     dhd.is_plugged = False
     with pytest.raises(DeviceError, match="communication error"):
@@ -192,9 +192,7 @@ def test_force_dimension_that_is_unplugged_is_told(dhd: FakeDhd) -> None:
 # --- OpenHaptics --------------------------------------------------------------------------------
 
 
-def test_openhaptics_turns_millimetres_and_columns_into_a_pose(
-    hd: FakeHd, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_openhaptics_pose_conversion(hd: FakeHd, capsys: pytest.CaptureFixture[str]) -> None:
     device = opened(OpenHapticsDevice("Left"))
     reading = device.read()
     assert np.allclose(reading.pose[:3, 3], [0.01, 0.02, 0.03])
@@ -207,7 +205,7 @@ def test_openhaptics_turns_millimetres_and_columns_into_a_pose(
     assert capsys.readouterr().out == ""
 
 
-def test_openhaptics_pushes_what_was_applied_capped(hd: FakeHd) -> None:
+def test_openhaptics_capped_force(hd: FakeHd) -> None:
     device = opened(OpenHapticsDevice())
     assert set(map(tuple, hd.forces)) == {(0.0, 0.0, 0.0)}
 
@@ -219,7 +217,7 @@ def test_openhaptics_pushes_what_was_applied_capped(hd: FakeHd) -> None:
     device.close()
 
 
-def test_openhaptics_lets_a_force_go_that_no_other_follows(hd: FakeHd) -> None:
+def test_openhaptics_force_times_out(hd: FakeHd) -> None:
     now = [0.0]
     device = opened(OpenHapticsDevice(clock=lambda: now[0]))
     device.apply(PUSH)
@@ -230,7 +228,7 @@ def test_openhaptics_lets_a_force_go_that_no_other_follows(hd: FakeHd) -> None:
 
 
 @pytest.mark.parametrize("handle", [None, INVALID_HANDLE])
-def test_openhaptics_that_is_not_there_is_told(hd: FakeHd, handle: int | None) -> None:
+def test_openhaptics_missing_device(hd: FakeHd, handle: int | None) -> None:
     hd.handle = handle
     with pytest.raises(DeviceError, match="no OpenHaptics device named 'Default Device'"):
         OpenHapticsDevice().open()
@@ -238,14 +236,14 @@ def test_openhaptics_that_is_not_there_is_told(hd: FakeHd, handle: int | None) -
 
 
 @pytest.mark.parametrize("code", [0x0103, 0x0302])
-def test_openhaptics_that_fails_to_start_is_let_go(hd: FakeHd, code: int) -> None:
+def test_openhaptics_start_failure_releases_device(hd: FakeHd, code: int) -> None:
     hd.error = code  # one code has a name in the package, the other has none
     with pytest.raises(DeviceError, match="failed to start"):
         OpenHapticsDevice().open()
     assert hd.calls[-2:] == ["stop_scheduler", ("close_device", 7)]
 
 
-def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
+def test_openhaptics_silent_device(hd: FakeHd) -> None:
     now = [0.0]
     device = opened(OpenHapticsDevice(clock=lambda: now[0]))
     hd.unplug()
@@ -259,7 +257,7 @@ def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
 # --- Haply --------------------------------------------------------------------------------------
 
 
-def test_haply_reports_what_the_service_says(haply: FakeHaply) -> None:
+def test_haply_reading_of_service(haply: FakeHaply) -> None:
     haply.velocity = vector(0.1, 0.2, 0.3)
     device = opened(HaplyDevice(url=haply.url))
     reading = device.read()
@@ -271,7 +269,7 @@ def test_haply_reports_what_the_service_says(haply: FakeHaply) -> None:
     device.close()
 
 
-def test_haply_is_told_forces_capped_and_nothing_else(haply: FakeHaply) -> None:
+def test_haply_sends_capped_forces_only(haply: FakeHaply) -> None:
     device = opened(HaplyDevice("049D", url=haply.url))
     for _ in range(3):
         device.read()
@@ -285,7 +283,7 @@ def test_haply_is_told_forces_capped_and_nothing_else(haply: FakeHaply) -> None:
     assert all("session" not in message for message in haply.told[1:])
 
 
-def test_haply_reads_the_newest_state_whatever_was_asked_before(haply: FakeHaply) -> None:
+def test_haply_newest_state(haply: FakeHaply) -> None:
     device = opened(HaplyDevice(url=haply.url))
     for n in range(5):
         device.apply(PUSH)
@@ -304,7 +302,7 @@ def test_haply_reads_the_newest_state_whatever_was_asked_before(haply: FakeHaply
         ("verse_grip", {"button": True, "hall": 3}, 1),
     ],
 )
-def test_haply_takes_turns_and_buttons_from_the_grip(
+def test_haply_grip_orientation_and_buttons(
     haply: FakeHaply, kind: str, state: dict[str, object], buttons: int
 ) -> None:
     half = math.sqrt(0.5)
@@ -319,7 +317,7 @@ def test_haply_takes_turns_and_buttons_from_the_grip(
     device.close()
 
 
-def test_haply_without_the_device_is_told(haply: FakeHaply) -> None:
+def test_haply_missing_device(haply: FakeHaply) -> None:
     with pytest.raises(DeviceError, match=r"no Inverse3 XY at .* it has 049D"):
         HaplyDevice("XY", url=haply.url).open()
     haply.devices = []
@@ -327,7 +325,7 @@ def test_haply_without_the_device_is_told(haply: FakeHaply) -> None:
         HaplyDevice(url=haply.url).open()
 
 
-def test_haply_without_the_service_is_told(haply: FakeHaply) -> None:
+def test_haply_missing_service(haply: FakeHaply) -> None:
     url = haply.url
     haply.__exit__(None, None, None)
     with pytest.raises(DeviceError, match="no Haply Inverse Service") as caught:
@@ -336,7 +334,7 @@ def test_haply_without_the_service_is_told(haply: FakeHaply) -> None:
 
 
 @pytest.mark.parametrize("stops", [False, True])
-def test_haply_that_goes_silent_or_whose_service_stops_is_told(
+def test_haply_silent_or_stopped_service(
     haply: FakeHaply, stops: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device = opened(HaplyDevice(url=haply.url))
@@ -353,7 +351,7 @@ def test_haply_that_goes_silent_or_whose_service_stops_is_told(
     device.close()
 
 
-def test_haply_is_sought_on_this_machine_only() -> None:
+def test_haply_url_local_only() -> None:
     for url in ("ws://192.0.2.1:10001", "wss://localhost:10001"):
         with pytest.raises(UsageError, match="on this machine"):
             HaplyDevice(url=url)

@@ -31,7 +31,7 @@ def arch(n: int, inner: float = 4000.0, outer: float = 4300.0, deep: float = 500
 @pytest.mark.parametrize(
     ("n", "seed"), [*((n, seed) for n in (25, 100) for seed in range(3)), (301, 1), (951, 2)]
 )
-def test_neighbours_in_an_arch_touch_and_no_others(n: int, seed: int) -> None:
+def test_classify_pair_arch_neighbours_touch(n: int, seed: int) -> None:
     """In any frame, where shared corners stay equal; the gap of the others is the inner chord."""
     wedges = [placed(wedge, frame_of(seed)) for wedge in arch(n)]
     chord = 2.0 * 4000.0 * np.sin(0.5 * np.pi / n)
@@ -44,7 +44,7 @@ def test_neighbours_in_an_arch_touch_and_no_others(n: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize("n", [25, 951])
-def test_one_wedge_that_is_placed_many_times_touches_its_neighbour(n: int) -> None:
+def test_classify_pair_arch_of_placed_wedge(n: int) -> None:
     """Its corners are turned, so that shared ones differ by rounding."""
     wedge, angle = CollisionShape(MM * arch(n)[0]), np.pi / n
     for i in range(n - 1):
@@ -56,7 +56,7 @@ def test_one_wedge_that_is_placed_many_times_touches_its_neighbour(n: int) -> No
         assert found.kind == "touching"
 
 
-def test_an_arch_of_301_objects_has_300_pairs_that_touch(tmp_path: Path) -> None:
+def test_find_clashes_arch_300_touching_pairs(tmp_path: Path) -> None:
     surfaces = {f"wedge {i}": wedge for i, wedge in enumerate(arch(301))}
     with imported(tmp_path / "arch.db", surfaces) as env:
         found = find_clashes(env)

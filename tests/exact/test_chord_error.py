@@ -40,7 +40,7 @@ def moving(env: Environment, tool: PointShell, by: Triple, contact: float = 0.05
     return swept(env, tool, pulls(by), ["plate"], contact=contact).verdict
 
 
-def test_a_gap_is_less_by_the_chord_error(env: Environment) -> None:
+def test_sweep_gap_less_chord_error(env: Environment) -> None:
     exact, found = (passing(env, tool, 1.0) for tool in (EXACT, BLUNT))
     assert (exact.gap.error, found.gap.error) == (0.0, MM * ERROR)
     assert found.gap.at_least == pytest.approx(exact.gap.at_least - MM * ERROR, abs=1e-9)
@@ -51,7 +51,7 @@ def test_a_gap_is_less_by_the_chord_error(env: Environment) -> None:
     ("gap", "verdict"),
     [(0.05, "clear"), (0.015, "not decided"), (-0.01, "not decided"), (-1.0, "hits")],
 )
-def test_what_is_met_by_less_is_not_decided(env: Environment, gap: float, verdict: str) -> None:
+def test_sweep_hit_within_chord_error_undecided(env: Environment, gap: float, verdict: str) -> None:
     found = passing(env, BLUNT, gap)
     assert found.verdict == verdict
     assert (found.undecided != ()) == (verdict == "not decided")
@@ -60,7 +60,7 @@ def test_what_is_met_by_less_is_not_decided(env: Environment, gap: float, verdic
         assert passing(env, EXACT, gap).verdict == ("clear" if gap > 0.0 else "hits")
 
 
-def test_a_contact_is_free_with_less_reach(env: Environment) -> None:
+def test_sweep_contact_tolerance_less_chord_error(env: Environment) -> None:
     along, into, little = (50.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, -0.05)
     assert moving(env, BLUNT, along) == "slides"
     assert moving(env, BLUNT, along, contact=0.015) == "not decided"
@@ -84,7 +84,7 @@ def judged(gap: float) -> PairResult:
         (-0.02, "touching"), (-0.045, "not known"), (-1.0, "overlapping"),
     ],
 )  # fmt: skip
-def test_a_pair_is_known_beyond_the_chord_error(gap: float, kind: str) -> None:
+def test_classify_pair_chord_error_bounds(gap: float, kind: str) -> None:
     found = judged(gap)
     assert found.kind == kind
     if kind == "apart":
@@ -95,7 +95,7 @@ def test_a_pair_is_known_beyond_the_chord_error(gap: float, kind: str) -> None:
         assert found.at_most / MM >= -gap + ERROR
 
 
-def test_a_box_holds_the_true_surface(tmp_path: Path) -> None:
+def test_part_bounds_include_chord_error(tmp_path: Path) -> None:
     part = read_file(cylinder(tmp_path / "rod.step", 10.0, 20.0)).parts[0]
     points, chord = part.world_points(), part.placed_chord
     assert chord > 0.0

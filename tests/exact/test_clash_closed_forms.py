@@ -37,7 +37,7 @@ def check(one: Meeting, a: Floats, b: Floats) -> None:
 
 @pytest.mark.parametrize("seed", FRAMES)
 @pytest.mark.parametrize("name", SCENES)
-def test_kind_and_depth_of_a_pair(name: str, seed: int) -> None:
+def test_classify_pair_kind_and_depth(name: str, seed: int) -> None:
     """The same in any frame, and both ways round."""
     one, frame = SCENES[name], frame_of(seed)
     a, b = placed(one.a, frame), placed(one.b, frame)
@@ -46,7 +46,7 @@ def test_kind_and_depth_of_a_pair(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", [one.name for one in MEETINGS if "void" not in one.name])
-def test_winding_does_not_matter(name: str) -> None:
+def test_classify_pair_independent_of_winding(name: str) -> None:
     """Files hold bodies inside out; a void beside its body is told by its winding alone."""
     one = SCENES[name]
     check(one, inverted(one.a), one.b)
@@ -54,7 +54,7 @@ def test_winding_does_not_matter(name: str) -> None:
 
 
 @pytest.mark.parametrize("gap", [1e-6, 0.02, 0.3, 0.99, 1.1])
-def test_a_gap_is_told_to_a_millionth_of_a_millimetre(gap: float) -> None:
+def test_classify_pair_gap_precision(gap: float) -> None:
     found = judged(box((4, 4, 4)), box((4, 4, 4), (4.0 + gap, 1.0, 0.5)))
     assert found.kind == ("touching" if gap < CONTACT else "apart" if gap < 1.0 else "far")
     if found.kind != "far":
@@ -62,7 +62,7 @@ def test_a_gap_is_told_to_a_millionth_of_a_millimetre(gap: float) -> None:
 
 
 @pytest.mark.parametrize("seed", FRAMES)
-def test_the_deepest_place_of_equal_shapes_is_in_both(seed: int) -> None:
+def test_classify_pair_deepest_point_in_both(seed: int) -> None:
     """One shape twice, and two equal ones."""
     one, same = (CollisionShape(MM * box((100, 20, 20))) for _ in range(2))
     pose = frame_of(seed)
@@ -81,7 +81,7 @@ RIB = (20.0, (0.0, 0.0, 2.0))
 
 @pytest.mark.parametrize("n", [1, 4, 16, 33])
 @pytest.mark.parametrize("aside", [0.0, 0.001, 0.37, 15.0 / 16.0])
-def test_a_sheet_through_a_sheet_overlaps_however_it_is_meshed(n: int, aside: float) -> None:
+def test_classify_pair_crossing_sheets_overlap(n: int, aside: float) -> None:
     """Also where mesh lines coincide: how deep is not known where nothing is closed."""
     side, at = RIB
     rib = grid("x", side, max(n - 1, 1), (aside, at[1], at[2]))
@@ -93,7 +93,7 @@ def test_a_sheet_through_a_sheet_overlaps_however_it_is_meshed(n: int, aside: fl
 
 @pytest.mark.parametrize("thick", [0.08, 0.5, 2.0])
 @pytest.mark.parametrize("times", [0, 1, 2])
-def test_depth_in_a_closed_body_does_not_depend_on_the_mesh(times: int, thick: float) -> None:
+def test_classify_pair_open_rib_depth_independent_of_mesh(times: int, thick: float) -> None:
     """An open rib through a closed plate: half the plate's thickness, or unknown if thin."""
     plate = box((30, 30, thick))
     told = []
@@ -118,7 +118,7 @@ def quartered(triangles: Floats, times: int) -> Floats:
 
 @pytest.mark.parametrize("times", [0, 1, 3])
 @pytest.mark.parametrize(("at", "depth"), [((9.5, 1.0, 0.7), 0.5), ((3.0, 2.0, 9.0), 1.0)])
-def test_depth_of_boxes_does_not_depend_on_the_mesh(
+def test_classify_pair_box_depth_independent_of_mesh(
     times: int, at: tuple[float, float, float], depth: float
 ) -> None:
     fine = quartered(box((10, 10, 10)), times)
@@ -132,7 +132,7 @@ def test_depth_of_boxes_does_not_depend_on_the_mesh(
 
 
 @pytest.mark.parametrize("times", [0, 1, 3])
-def test_an_open_sheet_in_a_body_is_as_deep_as_it_goes(times: int) -> None:
+def test_classify_pair_open_sheet_depth(times: int) -> None:
     """A sheet that ends 3 below the face of a cube, on its mesh lines and beside."""
     for n, aside in ((1, 0.0), (1, 0.21), (13, 0.0), (13, 0.21)):
         blade = grid("x", 6.0, n, (aside, 0.0, 10.0))
@@ -141,7 +141,7 @@ def test_an_open_sheet_in_a_body_is_as_deep_as_it_goes(times: int) -> None:
         assert 3.0 - 0.07 <= found.at_least <= 3.0 + 1e-6
 
 
-def test_a_sheet_flush_with_a_sheet_touches_however_it_is_meshed() -> None:
+def test_classify_pair_flush_sheets_touch() -> None:
     for n in (1, 5, 16):
         for at in ((0.0, 0.0, 0.0), (0.3, 0.2, 0.0), (0.0, 0.0, 0.03)):
             assert judged(grid("z", 20.0, n, at), grid("z", 30.0, n + 1)).kind == "touching"

@@ -92,14 +92,14 @@ def check_a_path(rng: np.random.Generator) -> str:
         *(pytest.param(seed, 50, marks=pytest.mark.long) for seed in drawn(range(100, 120), 2)),
     ],
 )
-def test_random_paths_of_boxes_are_told_as_they_are(seed: int, n: int) -> None:
+def test_least_random_box_paths_against_exact_boxes(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     told = [check_a_path(rng) for _ in range(n)]
     assert min(told.count("hits"), told.count("clear")) >= n / 10
 
 
 @pytest.mark.parametrize("gap", [5e-5, 4e-4, 8e-3])
-def test_a_box_slides_along_another_at_its_gap(gap: float) -> None:
+def test_least_sliding_box_gap(gap: float) -> None:
     still = Boxes(np.eye(4)[None], np.array([[0.3, 0.05, 0.02]]))
     tool = Boxes(np.eye(4)[None], np.array([[0.02, 0.02, 0.02]]))
     poses = np.tile(np.eye(4), (2, 1, 1))
@@ -111,7 +111,7 @@ def test_a_box_slides_along_another_at_its_gap(gap: float) -> None:
     assert gap - error_of(gap) - 1e-12 <= closed <= gap
 
 
-def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
+def test_least_ball_closed_form() -> None:
     still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[0.3, 0.0, 0.0], [0.15, 0.02, 0.0]]
@@ -124,7 +124,7 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
     assert np.allclose(found.on_object, [0.1, 0.02, 0.0], atol=3e-4)
 
 
-def test_a_limit_of_time_ends_the_search() -> None:
+def test_least_time_limit() -> None:
     still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
     way = ToolPath.of(np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 3)), np.zeros(3))
     pair = Pair(bvh_of(still), tool_of(still), way, time.monotonic() - 1.0)

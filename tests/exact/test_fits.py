@@ -25,9 +25,7 @@ FITS = {
         ("round 16 mm", 0.5 * (16.5e-3 - 15.983e-3)),
     ],
 )
-def test_a_peg_comes_out_of_its_hole_with_its_radial_gap(
-    tmp_path: Path, name: str, nominal: float | None
-) -> None:
+def test_sweep_peg_radial_gap(tmp_path: Path, name: str, nominal: float | None) -> None:
     """8 mm and 16 mm wide; the hole's 8.99 mm are 11 to 18 voxels."""
     hole, peg = (
         Path(os.environ["HAPTICDB_TEST_DATA"], "fits", f"factory_{part}.obj") for part in FITS[name]

@@ -120,7 +120,7 @@ def test_gap_curve_is_zero_in_a_hit_and_inside(env: Environment) -> None:
     assert found.gaps.intervals[-1].end == 1.0
 
 
-def test_gap_curve_without_time_is_stopped(env: Environment) -> None:
+def test_gap_curve_time_limit(env: Environment) -> None:
     path = line((0, 0, 50), (-100, 0, 50))
     found = sweep(env, CUBE, path, within=WITHIN, seconds=1e-9)
     assert found.gaps is not None
@@ -130,7 +130,7 @@ def test_gap_curve_without_time_is_stopped(env: Environment) -> None:
         sweep(env, CUBE, path, within=0.0)
 
 
-def test_gap_curve_write_makes_a_table_or_a_plot(env: Environment, tmp_path: Path) -> None:
+def test_gap_curve_write_table_or_plot(env: Environment, tmp_path: Path) -> None:
     found = sweep(env, CUBE, line((0, 0, 50), (-100, 0, 50)), within=WITHIN)
     assert found.gaps is not None
     found.gaps.write(tmp_path / "gaps.csv")

@@ -27,7 +27,7 @@ def along_x(*ways: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     return poses
 
 
-def test_a_straight_way_meets_each_part_where_the_gaps_say(path: Path) -> None:
+def test_find_meetings_translation_closed_form(path: Path) -> None:
     with hapticdb.open(path, read_only=True) as env:
         found = find_meetings(env, ["cube0"], along_x(0.0, 0.9), contact=CONTACT)
         assert [(one.name, one.kind) for one in found] == [
@@ -55,7 +55,7 @@ def are_apart(turn: float) -> bool:
     return False
 
 
-def test_a_hinge_meets_as_separating_axes_say(path: Path) -> None:
+def test_find_meetings_hinge_closed_form(path: Path) -> None:
     with hapticdb.open(path, read_only=True) as env:
         about = (0.15, 0.0, 0.0)
         poses = hinge(2, about, 0.0, 360.0)
@@ -69,7 +69,7 @@ def test_a_hinge_meets_as_separating_axes_say(path: Path) -> None:
         assert find_meetings(env, ["cube1"], half, about=about, against=["cube0"]) == []
 
 
-def test_what_only_touches_all_the_way_is_told_as_that(tmp_path: Path) -> None:
+def test_find_meetings_sliding_contact_is_touching(tmp_path: Path) -> None:
     """A cube slides along the flush face of another: no meeting is deeper than the tolerance."""
     with hapticdb.open(row_of_boxes(tmp_path / "flush.db", 2), read_only=True) as env:
         poses = np.tile(np.eye(4), (2, 1, 1))
@@ -80,6 +80,6 @@ def test_what_only_touches_all_the_way_is_told_as_that(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("begin", "end"), [(0.0, 0.0), (0.0, 361.0), (np.nan, 1.0)])
-def test_turns_that_cannot_be_are_refused(begin: float, end: float) -> None:
+def test_hinge_bad_angles(begin: float, end: float) -> None:
     with pytest.raises(UsageError, match="degrees"):
         hinge(0, (0.0, 0.0, 0.0), begin, end)

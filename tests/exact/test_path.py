@@ -59,7 +59,7 @@ def path_poses(moved: list[Any], seed: int, center: Floats) -> Floats:
     corners=st.sampled_from([BALL, ROD]),
     shares=shares,
 )
-def test_poses_on_the_way_are_those_of_plain_formulas(
+def test_tool_path_poses_closed_form(
     moved: list[Any], seed: int, corners: Floats, shares: list[float]
 ) -> None:
     center = middle_of(corners)
@@ -80,7 +80,7 @@ def test_poses_on_the_way_are_those_of_plain_formulas(
 
 @settings(max_examples=30, deadline=None)
 @given(axis=directions, seed=st.integers(0, 99), share=st.floats(0.0, 1.0))
-def test_half_a_turn_goes_evenly_one_way_round(axis: Any, seed: int, share: float) -> None:  # noqa: ANN401
+def test_tool_path_half_turn_constant_rate(axis: Any, seed: int, share: float) -> None:  # noqa: ANN401
     poses = path_poses([(0.0, (1, 0, 0), np.pi, axis)], seed, np.zeros(3))
     path = ToolPath.of(poses, BALL, np.zeros(3))
     turn = path.at([share * path.length])[0, :3, :3] @ poses[0, :3, :3].T
@@ -98,7 +98,7 @@ def test_half_a_turn_goes_evenly_one_way_round(axis: Any, seed: int, share: floa
     spread=st.sampled_from([0.0, 2e-7]),
     shares=shares,
 )
-def test_no_place_of_the_tool_moves_more_than_the_way(
+def test_tool_path_parameter_bounds_motion(
     moved: list[Any], seed: int, corners: Floats, about: float, spread: float, shares: list[float]
 ) -> None:
     """about: metres from the tool's middle to the centre of the turns; spread: what given poses
@@ -114,9 +114,7 @@ def test_no_place_of_the_tool_moves_more_than_the_way(
 
 
 @pytest.mark.parametrize(("degrees", "told"), [(169.0, ""), (172.0, "172 degrees"), (270.0, "")])
-def test_a_turn_takes_the_short_way_with_a_warning_near_half_a_turn(
-    degrees: float, told: str
-) -> None:
+def test_tool_path_shorter_rotation_and_warning(degrees: float, told: str) -> None:
     way = ToolPath.of(hinge(2, (0, 0, 0), 0.0, degrees)[[0, -1]], BALL, np.zeros(3))
     assert np.degrees(np.linalg.norm(way.motion.turns)) == pytest.approx(
         min(degrees, 360.0 - degrees)
@@ -127,7 +125,7 @@ def test_a_turn_takes_the_short_way_with_a_warning_near_half_a_turn(
     assert [told in str(one.message) for one in caught] == [True] * bool(told)
 
 
-def test_half_a_turn_is_refused() -> None:
+def test_tool_path_half_turn_refused() -> None:
     way = ToolPath.of(hinge(2, (0, 0, 0), 0.0, 180.0)[[0, -1]], BALL, np.zeros(3))
     with pytest.raises(UsageError, match=r"from pose 0 to pose 1 .* give a pose between"):
         way.checked()

@@ -199,7 +199,7 @@ def checked(folder: Path, seeds: list[int]) -> list[Case]:
     return cases
 
 
-def test_some_random_pulls_are_told_truly(tmp_path: Path) -> None:
+def test_sweep_random_pulls_sample(tmp_path: Path) -> None:
     cases = checked(tmp_path, drawn(range(ALL), SOME))
     verdicts = {case.found.verdict for case in cases}
     assert verdicts >= {"clear", "slides", "hits"}
@@ -207,14 +207,14 @@ def test_some_random_pulls_are_told_truly(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", range(4))
-def test_random_pulls_are_told_truly(tmp_path: Path, part: int) -> None:
+def test_sweep_random_pulls_all(tmp_path: Path, part: int) -> None:
     cases = checked(tmp_path, list(range(part, ALL, 4)))
     n_free = sum(case.found.verdict in FREE for case in cases)
     assert 0.3 * len(cases) < n_free < 0.7 * len(cases)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_oracle_sees_what_goes_through(seed: int) -> None:
+def test_random_pulls_oracle_closed_form(seed: int) -> None:
     """Winding numbers of a turned block, and lines through it, off it, and at its border."""
     frame = frame_of(seed)
     block = Surface(placed(box((4, 4, 4)), frame), seed=seed)

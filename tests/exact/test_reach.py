@@ -160,7 +160,7 @@ def check_among_boxes(folder: Path, seed: int, count: int, step: int) -> int:
     return found.n_free
 
 
-def test_reach_without_time_is_not_decided(env: Environment) -> None:
+def test_reach_time_limit_undecided(env: Environment) -> None:
     found = reached(env, "sheet", "wide", seconds=1e-9)
     assert [one.verdict for one in found.targets] == ["not decided"]
     assert found.columns()["verdict"] == ["not decided"]
@@ -181,7 +181,7 @@ def test_reach_without_time_is_not_decided(env: Environment) -> None:
         ({"approach": "up"}, UsageError, "approach 'up'"),
     ],
 )
-def test_reach_refuses(
+def test_reach_bad_arguments(
     env: Environment, options: dict[str, Any], error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=re.escape(words)):

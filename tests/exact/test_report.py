@@ -47,19 +47,19 @@ DEEP = HIT._replace(at_least=2e-3)
          "lies inside tank; pea lies inside the tool; hits seat at 25 % of the path"),
     ],
 )  # fmt: skip
-def test_the_verdict_is_told_in_a_line(found: Swept, verdict: str, told: str) -> None:
+def test_verdict_line_cases(found: Swept, verdict: str, told: str) -> None:
     assert found.verdict == verdict
     assert told in verdict_line(found, TOOL)
 
 
-def test_what_time_has_ended_is_not_decided_unless_something_is_hit() -> None:
+def test_verdict_line_time_limit() -> None:
     assert verdict_line(swept(is_stopped=True), TOOL).startswith("not decided: the time was over")
     late = swept(is_stopped=True, hits=(place_at(BOLT, 0.5, PATH),))
     assert late.verdict == "hits"
     assert "the time was over" in verdict_line(late, TOOL)
 
 
-def test_a_gap_without_a_place_is_a_bound() -> None:
+def test_gap_text_bounds() -> None:
     assert [gap_text(swept(gap=gap)) for gap in (GAP, Gap(0.5, 0.5, None), swept().gap)] == [
         "0.4 mm", "more than 0.5 m", "-",
     ]  # fmt: skip

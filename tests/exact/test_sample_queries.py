@@ -47,7 +47,7 @@ def least(is_edges: bool, p: Floats, shift: Floats) -> float:
     return distance(p[2] - p[0], shift, p[2] - p[3])[0]  # beyond the far edge of the triangle
 
 
-def test_no_collision_of_the_sample_queries_is_missed(real_files: Path) -> None:
+def test_sweep_sample_queries_no_missed_collision(real_files: Path) -> None:
     """A false one is nearer than the tolerance, 0.01 mm, with coordinates taken as metres."""
     counts: Counter[tuple[bool, bool]] = Counter()
     with (real_files / "ccd" / "translations.csv").open(newline="", encoding="utf-8") as file:

@@ -79,7 +79,7 @@ def names(found: Swept) -> list[str]:
     return [place.object.name for place in found.hits]
 
 
-def test_a_gap_is_told_with_its_places_whatever_the_voxels(tmp_path: Path) -> None:
+def test_sweep_gap_independent_of_voxels(tmp_path: Path) -> None:
     parts = {name: box_at(*placed) for name, placed in PARTS.items()}
     told = []
     for bits in (4, 7):
@@ -98,7 +98,7 @@ def test_a_gap_is_told_with_its_places_whatever_the_voxels(tmp_path: Path) -> No
     assert told[0] == told[1]
 
 
-def test_the_first_contact_of_each_object_is_told_in_order(env: Environment) -> None:
+def test_sweep_first_contacts_in_order(env: Environment) -> None:
     found = sweep(env, TOOL, line((-0.1, 0.0, 0.06), (-0.1, 0.0, 0.16), (0.2, 0.0, 0.16)))
     assert found.verdict == "hits"
     assert names(found) == ["shelf", "wall"]
@@ -115,7 +115,7 @@ def test_the_first_contact_of_each_object_is_told_in_order(env: Environment) -> 
     assert first.hits[0].fraction == pytest.approx(shelf.fraction, abs=1e-4)
 
 
-def test_what_is_chosen_can_be_met_and_nothing_else(env: Environment) -> None:
+def test_sweep_selection_of_objects(env: Environment) -> None:
     path = line((-0.1, 0.0, 0.06), (-0.1, 0.0, 0.16))
     assert names(sweep(env, TOOL, path)) == ["shelf"]
     assert sweep(env, TOOL, path, exclude=["shelf"]).verdict == "clear"
@@ -131,7 +131,7 @@ def test_what_is_chosen_can_be_met_and_nothing_else(env: Environment) -> None:
 SEATED = (0.0, 0.0, 0.5 * CUBE)
 
 
-def test_a_part_slides_along_what_it_stands_on_or_lifts_off(env: Environment) -> None:
+def test_sweep_part_slides_or_lifts_off(env: Environment) -> None:
     lifted = sweep(env, TOOL, line(SEATED, (0.0, 0.0, 0.1)))
     assert (lifted.verdict, lifted.comes_out) == ("clear", True)
     (plate,) = lifted.touching
@@ -146,7 +146,7 @@ def test_a_part_slides_along_what_it_stands_on_or_lifts_off(env: Environment) ->
     assert (still.verdict, still.is_free, still.comes_out) == ("slides", True, False)
 
 
-def test_nothing_deeper_than_twice_the_tolerance_is_clear(env: Environment) -> None:
+def test_sweep_hits_deeper_than_tolerance(env: Environment) -> None:
     for deep in (0.5, 0.9, 2.1, 3.0, 400.0):
         found = sweep(env, TOOL, line(SEATED, (0.01, 0.0, 0.5 * CUBE - deep * CONTACT)))
         assert (found.verdict == "hits") == (deep > 2.0), deep
@@ -156,7 +156,7 @@ def test_nothing_deeper_than_twice_the_tolerance_is_clear(env: Environment) -> N
             assert hit.at_least > CONTACT
 
 
-def test_a_tolerance_tells_what_touches(env: Environment) -> None:
+def test_sweep_contact_tolerance(env: Environment) -> None:
     path = line((0.0, 0.0, 0.5 * CUBE + 2e-4), (0.05, 0.0, 0.5 * CUBE + 2e-4))
     assert sweep(env, TOOL, path).verdict == "clear"
     assert sweep(env, TOOL, path, contact=3e-4).verdict == "slides"
@@ -165,7 +165,7 @@ def test_a_tolerance_tells_what_touches(env: Environment) -> None:
 # --- inside --------------------------------------------------------------------------------------
 
 
-def test_what_is_inside_the_other_is_told(tmp_path: Path) -> None:
+def test_sweep_enclosed_objects(tmp_path: Path) -> None:
     parts = {"tank": box_at((0.3,) * 3, (0.0,) * 3), "pea": box_at((0.01,) * 3, (1.0, 0.0, 0.0))}
     hollow = trimesh.creation.box((CUBE,) * 3)
     hollow.update_faces(np.arange(len(hollow.faces)) > 1)  # a box without a side is open
@@ -183,7 +183,7 @@ def test_what_is_inside_the_other_is_told(tmp_path: Path) -> None:
 # --- turns, balls, clouds ------------------------------------------------------------------------
 
 
-def test_a_turn_is_about_the_middle_or_a_place_that_is_named(env: Environment) -> None:
+def test_sweep_rotation_about_centre(env: Environment) -> None:
     rod = shell_of(box_at((0.2, 0.01, 0.01), (0.1, 0.0, 0.0)))
     quarter = [pose_of((0.0, 0.0, 0.005), (1, 0, 0, 0)), pose_of((0.0, 0.0, 0.005), (1, 0, 0, 1))]
     path = np.array(quarter) + pose_of((-0.1, 0.0, 0.05)) - np.eye(4)
@@ -195,7 +195,7 @@ def test_a_turn_is_about_the_middle_or_a_place_that_is_named(env: Environment) -
         sweep(env, rod, path, about=(0.0, np.nan, 0.0))
 
 
-def test_the_points_of_a_cloud_are_met_and_never_touched(tmp_path: Path) -> None:
+def test_sweep_point_cloud_hits_never_touches(tmp_path: Path) -> None:
     file = tmp_path / "cloud.ply"
     x, y = np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.1, 0.1, 41))
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
@@ -212,7 +212,7 @@ def test_the_points_of_a_cloud_are_met_and_never_touched(tmp_path: Path) -> None
 # --- limits, revisions, wrong use -------------------------------------------------------
 
 
-def test_a_limit_ends_what_is_told_and_progress_counts_objects(env: Environment) -> None:
+def test_sweep_limit_and_progress(env: Environment) -> None:
     told: list[tuple[int, int]] = []
     found = sweep(env, TOOL, line((0.0, 0.0, 0.05)), limit=0.01)
     assert (found.gap[:3], found.verdict) == ((0.01, 0.01, None), "clear")
@@ -221,15 +221,13 @@ def test_a_limit_ends_what_is_told_and_progress_counts_objects(env: Environment)
     assert [done for done, _ in told] == list(range(1, len(told) + 1))
 
 
-def test_time_that_is_over_leaves_it_undecided(env: Environment) -> None:
+def test_sweep_time_limit_undecided(env: Environment) -> None:
     found = sweep(env, TOOL, line((0.0, 0.0, 0.05), (0.05, 0.0, 0.05)), seconds=1e-9)
     assert found.verdict == "not decided"
     assert found.gap.at_least == 0.0
 
 
-def test_time_ends_a_contact_that_is_followed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sweep_time_limit_in_contact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tool slides by many tolerances: each look at the clock takes a second of it."""
     seconds = count()
     clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
@@ -242,7 +240,7 @@ def test_time_ends_a_contact_that_is_followed(
     assert next(seconds) <= 25
 
 
-def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path) -> None:
+def test_sweep_one_revision(tmp_path: Path) -> None:
     parts = {name: box_at(*placed) for name, placed in PARTS.items()}
     with imported(tmp_path / "shared", parts) as env, hapticdb.open(env.url) as other:
         before = env.store.revision()
@@ -260,7 +258,7 @@ def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path) -> None:
     assert (names(after), after.revision) == ([], before + 1)
 
 
-def test_wrong_use_is_refused(env: Environment) -> None:
+def test_sweep_bad_arguments(env: Environment) -> None:
     path = line((0.0, 0.0, 0.05))
     points = PointShell(TOOL.points, TOOL.normals, TOOL.center)
     with pytest.raises(UsageError, match="no surface"):

@@ -75,7 +75,7 @@ def outcome(found: Swept) -> str:
 
 @pytest.mark.parametrize("seed", FRAMES)
 @pytest.mark.parametrize("name", SEATED)
-def test_a_seated_part_is_free_overlaps_or_hits(env: Environment, name: str, seed: int) -> None:
+def test_sweep_seated_part_closed_forms(env: Environment, name: str, seed: int) -> None:
     """The proved depth is never more than the motion that frees, and both fit the scene."""
     pull = SCENES[name]
     found = found_in(env, pull, seed)
@@ -92,7 +92,7 @@ def test_a_seated_part_is_free_overlaps_or_hits(env: Environment, name: str, see
 
 @pytest.mark.parametrize("seed", FRAMES)
 @pytest.mark.parametrize("name", SCENES)
-def test_a_foreign_tool_has_no_seat(env: Environment, name: str, seed: int) -> None:
+def test_sweep_foreign_tool_overlap_is_hit(env: Environment, name: str, seed: int) -> None:
     """What overlaps at the start by more than the tolerance is hit there; all else is the same."""
     pull = SCENES[name]
     found = found_in(env, pull, seed, seated=False, overlap=MM * 100.0)
@@ -104,7 +104,7 @@ def test_a_foreign_tool_has_no_seat(env: Environment, name: str, seed: int) -> N
 
 @pytest.mark.parametrize("seed", FRAMES)
 @pytest.mark.parametrize("name", [p.name for p in PULLS if p.expected == "overlaps"])
-def test_an_overlap_that_is_accepted_is_clear(env: Environment, name: str, seed: int) -> None:
+def test_sweep_accepted_overlap_is_clear(env: Environment, name: str, seed: int) -> None:
     pull = SCENES[name]
     told = found_in(env, pull, seed)
     start = told.touching[0].start
@@ -113,7 +113,7 @@ def test_an_overlap_that_is_accepted_is_clear(env: Environment, name: str, seed:
     assert found_in(env, pull, seed, overlap=0.9 * start).verdict not in FREE
 
 
-def test_a_hood_in_its_seam_overlaps_by_two_millimetres(env: Environment) -> None:
+def test_sweep_hood_seam_depth(env: Environment) -> None:
     """The seam's depth is known from below and from above, where both are closed."""
     seam: Any
     (seam,) = found_in(env, SCENES["hood in its seam, up"], 0).touching
@@ -121,7 +121,7 @@ def test_a_hood_in_its_seam_overlaps_by_two_millimetres(env: Environment) -> Non
     assert seam.start == pytest.approx(2.0 * MM, rel=0.06)
 
 
-def test_a_peg_touches_until_it_has_left_its_bore(env: Environment) -> None:
+def test_sweep_peg_touches_until_out_of_bore(env: Environment) -> None:
     for seed in FRAMES:
         found = found_in(env, SCENES["coarse peg, out"], seed)
         (one,) = found.touching
@@ -129,7 +129,7 @@ def test_a_peg_touches_until_it_has_left_its_bore(env: Environment) -> None:
         assert one.until * 25.0 == pytest.approx(20.1, abs=0.15)
 
 
-def test_a_tool_within_a_body_is_hit_wherever_it_stands(env: Environment) -> None:
+def test_sweep_tool_inside_solid_is_hit(env: Environment) -> None:
     """Its gap to the face is below the tolerance, at it, and far above."""
     solid = [named(SCENES["inside"], 0)]
     for gap in (1e-4, 0.02, 0.05, 0.3, 5.0):
@@ -139,7 +139,7 @@ def test_a_tool_within_a_body_is_hit_wherever_it_stands(env: Environment) -> Non
                 assert swept(env, cube, poses, solid, seated=seated).verdict == "hits", gap
 
 
-def test_what_a_tool_holds_is_hit(env: Environment) -> None:
+def test_sweep_object_inside_tool_is_hit(env: Environment) -> None:
     """The object is inside the tool, near its face."""
     label = named(SCENES["sunk plate, rests"], 0)
     for gap in (0.02, 2.0):
@@ -147,7 +147,7 @@ def test_what_a_tool_holds_is_hit(env: Environment) -> None:
         assert swept(env, around, pulls((0, 0, -0.2)), [label]).verdict == "hits", gap
 
 
-def test_several_objects_are_touched_at_once(env: Environment) -> None:
+def test_sweep_contacts_judged_per_object(env: Environment) -> None:
     """Each is judged by itself: one free contact does not excuse another."""
     groove, base = named(SCENES["cube in a groove"], 0), named(SCENES["sunk plate, in"], 0)
     cube = box((5, 5, 5), (12.0, 0, 3.0))  # 0.5 above the floor, flush with the wall and the plate
@@ -159,7 +159,7 @@ def test_several_objects_are_touched_at_once(env: Environment) -> None:
     assert [hit.object.name for hit in found.hits] == [base]
 
 
-def test_what_is_left_may_not_be_entered_again(env: Environment) -> None:
+def test_sweep_reentry_is_hit(env: Environment) -> None:
     """A label that is lifted from the floor of its tin, and pushed down beside."""
     tin = [named(SCENES["label, down"], 0)]
     found = swept(env, LABEL, pulls((0, 0, 5), (5, 0, 5), (5, 0, -6)), tin)
@@ -169,7 +169,7 @@ def test_what_is_left_may_not_be_entered_again(env: Environment) -> None:
     assert outcome(found) == "free"
 
 
-def test_a_sheet_is_not_passed_whatever_the_length_of_the_path(env: Environment) -> None:
+def test_sweep_sheet_hit_for_any_path_length(env: Environment) -> None:
     """Looks at shares of the path may find it apart on the other side, by less than the reach."""
     sheet = [named(SCENES["sheet through sheet"], 0)]
     for length in np.geomspace(0.1, 40.0, 20):
@@ -178,7 +178,7 @@ def test_a_sheet_is_not_passed_whatever_the_length_of_the_path(env: Environment)
         assert first_hit(found) <= 0.1
 
 
-def test_a_ball_is_freed_as_surfaces_are(env: Environment) -> None:
+def test_sweep_ball_tool_contact(env: Environment) -> None:
     """A ball tool of radius 3 that stands on the block, or 0.03 or 1 in it."""
     block = [named(SCENES["shim"], 0)]
     cases = ((0.0, False, "free"), (0.03, False, "free"), (1.0, False, "hits"),
@@ -195,7 +195,7 @@ def test_a_ball_is_freed_as_surfaces_are(env: Environment) -> None:
         assert first_hit(found) <= 0.2
 
 
-def test_a_part_of_two_bodies_is_one_tool(env: Environment) -> None:
+def test_sweep_two_body_tool(env: Environment) -> None:
     """One rests flush on the block, the other stands free: off, along, and in."""
     both = np.concatenate([box((5, 5, 5), (0, 0, 2.5)), rod(1, 4, 12, (8, 0, 3.0))])
     block = [named(SCENES["shim"], 0)]
@@ -203,7 +203,7 @@ def test_a_part_of_two_bodies_is_one_tool(env: Environment) -> None:
         assert outcome(swept(env, both, pulls(to), block)) == expected
 
 
-def test_extract_finds_no_way_out_of_a_closed_tin(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_extract_closed_tin_no_path(tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("tin")
     with imported(folder / "tin.db", {"tin": TIN, "label": LABEL}) as env:
         found = hapticdb.extract(env, "label", seconds=5.0, motions=100)
@@ -211,7 +211,7 @@ def test_extract_finds_no_way_out_of_a_closed_tin(tmp_path_factory: pytest.TempP
     assert found.verdict != "comes out"
 
 
-def test_extract_takes_a_part_out_that_overlaps_its_seat(
+def test_extract_part_overlapping_its_support(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     """A plate that stands 0.3 in the block, at its rim as in its middle."""

@@ -46,7 +46,7 @@ def turn_of(poses: Floats) -> Floats:
 # --- scenes whose ways are known by construction --------------------------------------------------
 
 
-def test_a_block_in_a_pocket_is_lifted_and_then_pulled(tmp_path: Path) -> None:
+def test_extract_pocket_lift_then_pull(tmp_path: Path) -> None:
     url = pocket(tmp_path)
     found = found_in(url, "block")
     assert (found.verdict, found.pulls) == ("comes out", found.blockers[0].pulls)
@@ -55,7 +55,7 @@ def test_a_block_in_a_pocket_is_lifted_and_then_pulled(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) -> None:
+def test_extract_ledge_slide_then_lift(tmp_path: Path) -> None:
     url = ledge(tmp_path)
     found = found_in(url, "plate")
     assert (found.verdict, found.is_planned) == ("comes out", True)
@@ -68,7 +68,7 @@ def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Path) -> None:
+def test_extract_bayonet_turn_then_lift(tmp_path: Path) -> None:
     url = bayonet(tmp_path)
     found = found_in(url, "bar")
     assert found.verdict == "comes out"
@@ -80,7 +80,7 @@ def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Pa
     assert (turn_of(poses[passing]) > 1.0).all()
 
 
-def test_no_pull_cuts_through_what_it_touches(tmp_path: Path) -> None:
+def test_extract_pull_through_contact_refused(tmp_path: Path) -> None:
     """The part has fewer hits while it passes a thin wall than at its start."""
     found = found_in(ledge(tmp_path), "plate", motions=0)
     assert found.path is None
@@ -88,7 +88,7 @@ def test_no_pull_cuts_through_what_it_touches(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_block_on_the_floor_of_a_closed_box_has_no_way(tmp_path: Path) -> None:
+def test_extract_block_on_floor_of_closed_box(tmp_path: Path) -> None:
     found = found_in(grounded(tmp_path), "block", motions=200)
     assert (found.verdict, found.is_planned) == ("no way found", True)
     assert [one.object.name for one in found.blockers] == ["cage"]

@@ -41,7 +41,7 @@ def assert_free(scene: Scene, found: Disassembly, gone: tuple[str, ...] = ()) ->
         assert len(step.excluded) == len(scene) - len(left)
 
 
-def test_what_lies_above_goes_first_in_a_stack(tmp_path: Path) -> None:
+def test_disassemble_stack_top_first(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, STACK), "content", keep=["pot"])
     assert order(found) == ["weight", "lid", "content"]
     assert (found.is_found, found.verdict, found.is_out_of_time) == (True, "comes out", False)
@@ -50,13 +50,13 @@ def test_what_lies_above_goes_first_in_a_stack(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_was_left_out_is_not_taken_off(tmp_path: Path) -> None:
+def test_disassemble_excluded_objects_stay(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, STACK), "content", exclude=["weight"], keep=["pot"])
     assert order(found) == ["lid", "content"]
     assert_free(STACK, found, gone=("weight",))
 
 
-def test_links_of_a_chain_have_no_order(tmp_path: Path) -> None:
+def test_disassemble_chain_links_no_order(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, CHAIN), "left")
     assert (found.is_found, found.verdict, found.steps) == (False, "no order found", ())
     assert [one.object.name for one in found.blockers] == ["right"]
@@ -65,14 +65,14 @@ def test_links_of_a_chain_have_no_order(tmp_path: Path) -> None:
     assert failed_line(found.failed[1]) == "no way found: blocked by left"
 
 
-def test_what_comes_out_at_once_needs_no_steps(tmp_path: Path) -> None:
+def test_disassemble_free_part_no_steps(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, STACK), "weight")
     assert (order(found), found.failed) == (["weight"], ())
     assert disassembly_line(found).startswith("nothing goes before: comes out straight")
 
 
 @pytest.mark.long
-def test_a_step_that_does_not_help_is_dropped(tmp_path: Path) -> None:
+def test_disassemble_drops_useless_step(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, WINDOW), "content", keep=["pot"])
     assert max(one.n_gone for one in found.failed) == 1  # the rod was off, and that did not help
     assert order(found) == ["lid", "content"]
@@ -80,13 +80,13 @@ def test_a_step_that_does_not_help_is_dropped(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_chains_end_at_the_depth(tmp_path: Path) -> None:
+def test_disassemble_depth_limit(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, STACK), "content", depth=1, keep=["pot"])
     assert not found.is_found
     assert "weight" not in {obj.name for one in found.failed for obj in one.parts}
 
 
-def test_the_time_ends_the_search(tmp_path: Path) -> None:
+def test_disassemble_time_limit(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, STACK), "content", seconds=1e-6)
     assert (found.is_found, found.is_out_of_time) == (False, True)
     assert found.verdict == "not decided"
@@ -94,12 +94,12 @@ def test_the_time_ends_the_search(tmp_path: Path) -> None:
     assert "the time is over" in disassembly_line(found)
 
 
-def test_parts_that_slide_along_others_are_steps(tmp_path: Path) -> None:
+def test_disassemble_sliding_part(tmp_path: Path) -> None:
     found = found_in(lid(tmp_path, 0.0), "lid")
     assert (found.is_found, found.verdict) == (True, "comes out")
 
 
-def test_the_last_object_that_stands_is_not_taken_off(tmp_path: Path) -> None:
+def test_disassemble_last_object_stays(tmp_path: Path) -> None:
     """Of two bodies, each comes out of the other, or neither does."""
     found = found_in(corner(tmp_path), "block")
     assert not found.is_found
@@ -108,9 +108,7 @@ def test_the_last_object_that_stands_is_not_taken_off(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_without_a_planner_straight_orders_are_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_disassemble_without_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shadow_planner(tmp_path, monkeypatch, "raise ImportError('no planner')")
     url = made(tmp_path, STACK)
     assert order(found_in(url, "lid", motions=100, keep=["pot"])) == ["weight", "lid"]
@@ -120,7 +118,7 @@ def test_without_a_planner_straight_orders_are_found(
 
 
 @pytest.mark.long
-def test_a_path_through_what_holds_is_no_step(tmp_path: Path) -> None:
+def test_disassemble_bolt_before_plate(tmp_path: Path) -> None:
     """A small bolt's head is a tenth of the contacts: the pull alone would cut through it."""
     found = found_in(made(tmp_path, held_by_a_head()), "plate", keep=["base"])
     assert order(found) == ["bolt", "plate"]

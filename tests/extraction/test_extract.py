@@ -40,7 +40,7 @@ from hapticdb.extraction.verdict import extraction_line
 # --- straight pulls ------------------------------------------------------------------------------
 
 
-def test_a_lid_above_its_pot_lifts_off_with_its_gap(tmp_path: Path) -> None:
+def test_extract_lid_above_pot_gap(tmp_path: Path) -> None:
     url = lid(tmp_path, 0.03)
     found = found_in(url, "lid", motions=0)
     assert found.path is not None
@@ -50,7 +50,7 @@ def test_a_lid_above_its_pot_lifts_off_with_its_gap(tmp_path: Path) -> None:
     assert extraction_line(found).startswith("comes out straight, ")
 
 
-def test_a_lid_on_its_pot_comes_out_though_it_touches_it(tmp_path: Path) -> None:
+def test_extract_lid_touching_pot(tmp_path: Path) -> None:
     url = lid(tmp_path, 0.0)
     found = found_in(url, "lid", motions=0)
     assert found.path is not None
@@ -62,7 +62,7 @@ def test_a_lid_on_its_pot_comes_out_though_it_touches_it(tmp_path: Path) -> None
     assert "; touches pot until " in extraction_line(found)
 
 
-def test_a_part_that_still_touches_at_its_end_slides(tmp_path: Path) -> None:
+def test_extract_touching_at_end_slides(tmp_path: Path) -> None:
     """A plate under a ledge can only slide along the floor and the ledge for a short way."""
     found = found_in(ledge(tmp_path), "plate", motions=0, out=0.01)
     assert (found.verdict, found.is_free) == ("slides", True)
@@ -70,9 +70,7 @@ def test_a_part_that_still_touches_at_its_end_slides(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
-def test_a_bolt_comes_out_of_a_bore_a_twentieth_of_a_voxel_wider(
-    tmp_path: Path, tilt: float
-) -> None:
+def test_extract_bolt_from_tight_bore(tmp_path: Path, tilt: float) -> None:
     """By voxels it is in contact all around; tilted, no axis of the world is its own."""
     found = found_in(recessed(tmp_path, tilt), "bolt", motions=0)
     assert found.path is not None
@@ -82,7 +80,7 @@ def test_a_bolt_comes_out_of_a_bore_a_twentieth_of_a_voxel_wider(
     assert found.path.swept.verdict == "clear"
 
 
-def test_a_nut_leaves_its_bolt_by_a_screw_motion_only(tmp_path: Path) -> None:
+def test_extract_nut_by_screw_motion(tmp_path: Path) -> None:
     url = threaded(tmp_path)
     assert found_in(url, "nut", motions=0).path is None
     found = found_in(url, "nut", motions=0, screw=PITCH)
@@ -94,7 +92,7 @@ def test_a_nut_leaves_its_bolt_by_a_screw_motion_only(tmp_path: Path) -> None:
     assert found_in(url, "nut", motions=0, screw=2.0 * PITCH).path is None
 
 
-def test_open_surfaces_come_out_of_contact_too(tmp_path: Path) -> None:
+def test_extract_open_surfaces_in_contact(tmp_path: Path) -> None:
     """Neither has an inside: that they cut nothing is told by what goes through them."""
     open_pot = walls((0.0, 0.0, 0.0), (0.2, 0.2, 0.1), 0.02, "+z")
     open_pot.update_faces(np.arange(len(open_pot.faces)) > 1)
@@ -106,7 +104,7 @@ def test_open_surfaces_come_out_of_contact_too(tmp_path: Path) -> None:
     assert [one.object.name for one in found.path.swept.touching] == ["pot"]
 
 
-def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:
+def test_extract_drawer_open_side_only(tmp_path: Path) -> None:
     url = drawer(tmp_path)
     found = found_in(url, "drawer", motions=0)
     assert found.path is not None
@@ -117,7 +115,7 @@ def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:
     assert [(one.object.name, one.pulls > 0) for one in found.blockers] == [("shaft", True)]
 
 
-def test_a_block_leaves_a_room_by_its_door_without_a_planner(
+def test_extract_block_through_door_without_planner(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By straight legs along the axes."""
@@ -135,7 +133,7 @@ def test_a_block_leaves_a_room_by_its_door_without_a_planner(
 # --- the planner ---------------------------------------------------------------------------------
 
 
-def test_a_way_round_a_corner_is_planned_and_proved(tmp_path: Path) -> None:
+def test_extract_corner_plan_confirmed(tmp_path: Path) -> None:
     url = corner(tmp_path)
     found = found_in(url, "block", seed=3)
     assert found.path is not None
@@ -148,7 +146,7 @@ def test_a_way_round_a_corner_is_planned_and_proved(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_same_seed_gives_the_same_path(tmp_path: Path) -> None:
+def test_extract_same_seed_same_path(tmp_path: Path) -> None:
     url = corner(tmp_path)
     found = found_in(url, "block", seed=3)
     assert found.path is not None
@@ -159,7 +157,7 @@ def test_the_same_seed_gives_the_same_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("to", [None, shifted(np.array([0.2, 0.0, 0.0]))])
-def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path, to: Any) -> None:  # noqa: ANN401
+def test_extract_enclosed_names_blocker(tmp_path: Path, to: Any) -> None:  # noqa: ANN401
     found = found_in(enclosed(tmp_path), "block", motions=60, to=to)
     assert (found.verdict, found.path, found.is_planned) == ("no way found", None, True)
     assert [one.object.name for one in found.blockers] == ["cage"]
@@ -168,7 +166,7 @@ def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path, to: A
     assert found.motions <= 2 * 60
 
 
-def test_the_time_ends_the_planner(tmp_path: Path) -> None:
+def test_extract_time_limit_of_planner(tmp_path: Path) -> None:
     """Without its end, ten million motions would take hours."""
     found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=1.0)
     assert found.path is None
@@ -177,7 +175,7 @@ def test_the_time_ends_the_planner(tmp_path: Path) -> None:
     assert "give more --seconds" in extraction_line(found)
 
 
-def test_its_sweeps_end_with_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extract_time_limit_of_sweeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each sweep takes all the time that it is given, a second at least, and decides nothing."""
     now = [0.0]
 
@@ -194,9 +192,7 @@ def test_its_sweeps_end_with_the_search(tmp_path: Path, monkeypatch: pytest.Monk
     assert now[0] <= 11.5
 
 
-def test_a_missing_planner_is_said_with_what_is_in_the_way(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_extract_missing_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shadow_planner(tmp_path, monkeypatch, "raise ImportError('no planner')")
     url = enclosed(tmp_path)
     with pytest.raises(MissingExtraError, match=r"cage is in the way.*pip install .*ompl"):
@@ -204,9 +200,7 @@ def test_a_missing_planner_is_said_with_what_is_in_the_way(
     assert found_in(url, "block", motions=0).verdict == "no way found"
 
 
-def test_a_planner_that_dies_is_an_error_and_no_wait(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_extract_planner_process_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shadow_planner(tmp_path, monkeypatch, "import os\nos.kill(os.getpid(), 9)")
     with pytest.raises(hapticdb.errors.HapticDBError, match="planner's process has ended"):
         found_in(enclosed(tmp_path), "block")
@@ -215,7 +209,7 @@ def test_a_planner_that_dies_is_an_error_and_no_wait(
 # --- to a pose -----------------------------------------------------------------------------------
 
 
-def test_a_pose_is_reached_straight_where_nothing_is_in_the_way(tmp_path: Path) -> None:
+def test_extract_goal_pose_straight(tmp_path: Path) -> None:
     goal = trimesh.transformations.rotation_matrix(0.3, [0.0, 0.0, 1.0])
     goal[2, 3] = 0.05
     found = found_in(lid(tmp_path, 0.03), "lid", to=goal)
@@ -225,7 +219,7 @@ def test_a_pose_is_reached_straight_where_nothing_is_in_the_way(tmp_path: Path) 
     assert extraction_line(found).startswith("reaches the pose straight, ")
 
 
-def test_a_pose_round_a_corner_is_reached_by_a_plan(tmp_path: Path) -> None:
+def test_extract_goal_pose_planned(tmp_path: Path) -> None:
     """In the channel's arm along x, where no straight pull leads."""
     goal = shifted(np.array([0.15, 0.0, 0.265]))
     found = found_in(corner(tmp_path), "block", to=goal)
@@ -234,7 +228,7 @@ def test_a_pose_round_a_corner_is_reached_by_a_plan(tmp_path: Path) -> None:
     assert np.allclose(found.path.poses[-1], goal, atol=1e-12)
 
 
-def test_a_bolt_goes_into_its_bore(tmp_path: Path) -> None:
+def test_extract_goal_pose_in_bore(tmp_path: Path) -> None:
     """The pose is not free by voxels: a straight way back from it is."""
     with hapticdb.open(recessed(tmp_path, 0.0)) as env:
         (bolt,) = env.find("bolt")
@@ -249,7 +243,7 @@ def test_a_bolt_goes_into_its_bore(tmp_path: Path) -> None:
 # --- wrong arguments -----------------------------------------------------------------------------
 
 
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
+def test_extract_bad_arguments(tmp_path: Path) -> None:
     url = enclosed(tmp_path)
     with pytest.raises(ObjectNotFoundError, match="no object 'nut'"):
         found_in(url, "nut")
@@ -278,7 +272,7 @@ units = st.tuples(numbers, numbers, numbers).filter(lambda v: sum(x * x for x in
 
 
 @given(units, units, st.floats(0.01, 1.0))
-def test_a_part_is_out_at_the_given_distance_and_not_before(
+def test_exit_distances_of_spheres(
     way: tuple[float, float, float], center: tuple[float, float, float], radius: float
 ) -> None:
     """Out: the sphere is beyond a side of the box, [-1, 1] on each axis."""

@@ -41,7 +41,7 @@ print(server.pid, flush=True)
 @pytest.mark.parametrize(
     "how", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.long)], ids=str
 )
-def test_a_run_that_is_killed_leaves_no_server_no_process_and_no_file(how: signal.Signals) -> None:
+def test_child_killed_run_leaves_nothing(how: signal.Signals) -> None:
     with child([sys.executable, "-c", HOLDING], env=PATHS, stderr=None) as run:
         assert run.stdout is not None
         *numbers, folder = run.stdout.readline().split()
@@ -56,7 +56,7 @@ def test_a_run_that_is_killed_leaves_no_server_no_process_and_no_file(how: signa
         until(lambda: not Path(folder).exists())
 
 
-def test_a_child_is_killed_with_its_group_when_its_time_is_over() -> None:
+def test_child_timeout_kills_group() -> None:
     pids: list[int] = []
 
     def listen() -> None:

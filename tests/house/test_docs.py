@@ -40,7 +40,7 @@ def blocks(kind: str, page: str = "README.md") -> list[str]:
         ("docs/machines.md",),
     ],
 )
-def test_every_block_of_the_pages_runs(tmp_path: Path, pages: tuple[str, ...]) -> None:
+def test_docs_blocks_run(tmp_path: Path, pages: tuple[str, ...]) -> None:
     """All shell blocks in one session of the shell, then all Python blocks in one of Python."""
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     script = "\n".join(block for page in pages for block in blocks("sh", page))
@@ -54,7 +54,7 @@ def test_every_block_of_the_pages_runs(tmp_path: Path, pages: tuple[str, ...]) -
 
 @pytest.mark.long
 @pytest.mark.parametrize("binaries", FOUND, ids=named)
-def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
+def test_docs_postgresql_blocks_run(tmp_path: Path, binaries: Binaries) -> None:
     """The blocks use a server that libpq's environment variables name, and its pg_dump."""
     tools = f"{Path(sys.executable).parent}{os.pathsep}{binaries.bindir}{os.pathsep}"
     with serving(Path(tempfile.mkdtemp(prefix="plant-")), binaries, SETTINGS) as server:
@@ -72,13 +72,13 @@ def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binar
     assert "postgresql:///plant and postgresql:///restored hold the same" in found
 
 
-def test_the_postgresql_page_gives_the_settings_that_are_set() -> None:
+def test_docs_postgresql_settings() -> None:
     page = (ROOT / "docs" / "postgresql.md").read_text()
     shown = re.findall(r"^\| `(\w+)` \| `(\w+)` \|", page, re.MULTILINE)
     assert dict(shown) == link.SETTINGS
 
 
-def test_the_docs_show_the_sql_that_runs() -> None:
+def test_docs_sql_equals_code() -> None:
     shown = SHOWN.findall((ROOT / "docs" / "query.md").read_text())
     assert len(shown) == 8
     for module, constant, layout, text in shown:
@@ -86,7 +86,7 @@ def test_the_docs_show_the_sql_that_runs() -> None:
         assert text.split() == runs.split()
 
 
-def test_every_link_in_the_docs_leads_somewhere() -> None:
+def test_docs_links_resolve() -> None:
     for path in (*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
             assert "://" in target or (path.parent / target).exists(), f"{path}: {target}"

@@ -11,7 +11,7 @@ DRIVERS = {"apsw", "sqlite3", "psycopg"}
 ASKS_OF_TEXT = {"startswith", "endswith", "partition", "removeprefix", "match", "search"}
 
 
-def test_only_the_stores_know_their_engine() -> None:
+def test_modules_engine_independent_outside_store() -> None:
     """No other module imports an engine's driver or modules, or branches on an engine's name."""
     folders = {f"hapticdb.store.{path.parent.name}" for path in PACKAGE.glob("store/*/*_store.py")}
     assert len(folders) == 2

@@ -20,7 +20,7 @@ def numbers_of(page: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.stem))
-def test_the_numbers_of_the_tables_come_from_results(path: Path) -> None:
+def test_page_tables_numbers_from_results(path: Path) -> None:
     """After new results: python benchmarks/page_tables.py."""
     page = path.read_text()
     made = numbers_of(filled(page, records.read(RESULTS)))
@@ -28,12 +28,12 @@ def test_the_numbers_of_the_tables_come_from_results(path: Path) -> None:
     assert all(made.values())
 
 
-def test_every_table_stands_on_one_page() -> None:
+def test_page_tables_each_on_one_page() -> None:
     marks = [mark[2] for path in PAGES for mark in MARK.finditer(path.read_text())]
     assert sorted(marks) == sorted(tables())
 
 
-def test_every_plot_is_shown_and_every_result_is_named() -> None:
+def test_results_shown_or_named() -> None:
     text = "".join(path.read_text() for path in (ROOT / "docs").rglob("*.md"))
     used: set[str] = set()
 

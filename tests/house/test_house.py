@@ -71,12 +71,12 @@ def own(path: Path) -> set[str]:
 # --- imports ------------------------------------------------------------------------------------
 
 
-def test_every_module_stands_on_one_floor() -> None:
+def test_levels_every_module_drawn() -> None:
     drawn = sorted(name for floor in drawn_floors() for name in floor)
     assert drawn == sorted({domain(path) for path in modules()} - {"__init__"})
 
 
-def test_imports_point_one_way_and_no_farther_than_they_may() -> None:
+def test_imports_downward_and_narrow() -> None:
     for path in modules():
         if domain(path) == "__init__":
             continue
@@ -96,7 +96,7 @@ def round_about(below: dict[str, set[str]]) -> set[str]:
     return set(left)
 
 
-def test_no_two_domains_and_no_two_modules_import_each_other() -> None:
+def test_imports_acyclic() -> None:
     """Also within one floor, and also in imports for the type checker only."""
     domains: dict[str, set[str]] = {}
     for path in modules():
@@ -117,7 +117,7 @@ def dotted(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def test_kernels_and_terminals_and_benchmarks_are_kept_apart() -> None:
+def test_imports_kernels_cli_benchmarks_separate() -> None:
     """Kernels import numpy, numba with llvmlite, and their own folder; only cli/ draws."""
     benchmarks = {path.stem for path in (ROOT / "benchmarks").iterdir()} - {"__pycache__"}
     for path in modules():
@@ -161,7 +161,7 @@ def committed_texts() -> Iterator[tuple[str, str]]:
                 yield named(path), content.decode("utf-8", "replace")
 
 
-def test_no_text_names_this_machine_or_a_package_index() -> None:
+def test_texts_no_machine_path_or_index() -> None:
     place = re.compile(r"(?<![\w.~$}/])/(?:work|root|home|Users)/")
     # written so that the pattern does not match this file
     index = re.compile(r"pypi\.(org|python)|files\.pythonhosted|-index-ur[l]|-find-link[s]")
@@ -212,7 +212,7 @@ def _looks_at_clock(loop: ast.While) -> bool:
     )
 
 
-def test_nothing_is_waited_for_without_an_end() -> None:
+def test_waits_have_time_limit() -> None:
     """A wait without an end would let a failing test hang the run."""
     # the last three wait in something that another part ends: processes of a session, a fake's
     # thread; the servers' programs have a limit of their own
@@ -251,7 +251,7 @@ def test_version_of_changelog_and_citation() -> None:
 # --- the kernels' cache -------------------------------------------------------------------------
 
 
-def test_any_edit_of_a_kernel_asks_for_another_set(tmp_path: Path) -> None:
+def test_sources_digest_changes_with_any_edit(tmp_path: Path) -> None:
     """Also an edit of a leaf in another file than its entry's, with equal size and time stamp."""
     folder = tmp_path / "kernels"
     shutil.copytree(PACKAGE / "kernels", folder, ignore=shutil.ignore_patterns("__pycache__"))

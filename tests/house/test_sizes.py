@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from sources import modules, named, python_files, tree
 
 
-def test_no_file_is_longer_than_500_lines() -> None:
+def test_sizes_files_at_most_500_lines() -> None:
     lengths = {named(path): len(path.read_text().splitlines()) for path in python_files()}
     assert {name: n for name, n in lengths.items() if n > 500} == {}
 
@@ -25,7 +25,7 @@ def lengths(source: ast.Module) -> Iterator[tuple[str, int]]:
             yield node.name, node.end_lineno - node.lineno + 1
 
 
-def test_no_function_is_longer_than_60_lines() -> None:
+def test_sizes_functions_at_most_60_lines() -> None:
     long = {
         f"{named(path)}:{name}": n_lines
         for path in modules()
@@ -39,7 +39,7 @@ MOST_FILES = 15
 """Most Python files in a folder, without ``__init__``."""
 
 
-def test_no_folder_holds_more_than_15_files() -> None:
+def test_sizes_folders_at_most_15_files() -> None:
     counts = Counter(named(path.parent) for path in modules() if path.stem != "__init__")
     assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
 
@@ -50,7 +50,7 @@ def public_classes(source: ast.Module) -> list[str]:
     return [name for name in names if not name.startswith("_")]
 
 
-def test_a_public_class_name_stands_once() -> None:
+def test_names_public_classes_unique() -> None:
     homes: dict[str, list[str]] = {}
     for path in modules():
         for name in public_classes(tree(path)):
@@ -58,6 +58,6 @@ def test_a_public_class_name_stands_once() -> None:
     assert {n: paths for n, paths in homes.items() if len(paths) > 1} == {}
 
 
-def test_files_are_named_by_the_words_of_the_domain() -> None:
+def test_names_files_not_vague() -> None:
     vague = re.compile(r"util|helper|manager|(^|_)data(_|$)|common|misc")
     assert [named(p) for p in python_files() if vague.search(p.stem)] == []

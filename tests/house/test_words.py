@@ -38,7 +38,7 @@ def room_of(path: Path) -> str:
     return "/".join(folders[: 2 if folders[:1] == ("kernels",) else 1]) or "(root)"
 
 
-def test_rooms_are_described_by_nouns() -> None:
+def test_words_clauses_and_vague_verbs_by_room() -> None:
     texts: dict[str, list[str]] = defaultdict(list)
     for path in modules():
         texts[room_of(path)] += prose_of(tree(path))

@@ -36,7 +36,7 @@ def part_in(url: str | Path) -> Part:
         return part
 
 
-def test_it_is_stored_copied_checked_and_restored(tmp_path: Path, file: Path, place: Place) -> None:
+def test_chord_error_stored_copied_checked(tmp_path: Path, file: Path, place: Place) -> None:
     url, there = tmp_path / "a.db", place()
     (read,) = parse_in_process(file).parts
     report = imported(url, file)
@@ -54,7 +54,7 @@ def test_it_is_stored_copied_checked_and_restored(tmp_path: Path, file: Path, pl
     assert check_environment(there).is_sound
 
 
-def test_a_finer_tessellation_replaces_the_surface(tmp_path: Path, file: Path) -> None:
+def test_chord_error_finer_tessellation_replaces(tmp_path: Path, file: Path) -> None:
     url, other = tmp_path / "a.db", tmp_path / "b.db"
     imported(url, file, chord=1e-4)
     hapticdb.copy_environment(url, other)

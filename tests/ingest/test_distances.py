@@ -38,7 +38,7 @@ def a_grid(curve: CurveName) -> Grid:
 
 
 @pytest.mark.parametrize("curve", ["z", "hilbert"])
-def test_rows_with_distances_are_the_union(tmp_path: Path, curve: CurveName) -> None:
+def test_rows_of_part_distances_are_union(tmp_path: Path, curve: CurveName) -> None:
     part, grid = a_part(tmp_path), a_grid(curve)
     rows, n_voxels = rows_of_part(part, grid, "brick", distances=True)
     alone, n_alone = rows_of_part(part, grid, "brick")
@@ -54,7 +54,7 @@ def test_rows_with_distances_are_the_union(tmp_path: Path, curve: CurveName) -> 
     assert (unpack(*rows.distances) != BEYOND).any(axis=1).all()
 
 
-def test_either_curve_gives_a_brick_the_same_distances(tmp_path: Path) -> None:
+def test_rows_of_part_distances_same_on_both_curves(tmp_path: Path) -> None:
     part = a_part(tmp_path)
     found = []
     for curve in ("z", "hilbert"):
@@ -73,7 +73,7 @@ def test_either_curve_gives_a_brick_the_same_distances(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[0].distances.ends, ends)
 
 
-def test_a_cloud_has_distances_to_its_points(tmp_path: Path) -> None:
+def test_rows_of_part_cloud_distances(tmp_path: Path) -> None:
     header = "ply\nformat ascii 1.0\nelement vertex 2\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
     cloud = read_file(text(tmp_path / "a.ply", header + "0.105 0.1 0.1\n0.9 0.9 0.9\n")).parts[0]
@@ -87,7 +87,7 @@ def test_a_cloud_has_distances_to_its_points(tmp_path: Path) -> None:
     assert values.min() < 0.9 * 254 / 2.75
 
 
-def test_distances_that_do_not_fit_into_memory_are_refused(
+def test_rows_of_part_distances_out_of_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(voxelizing, "bytes_available", lambda: 1000)
@@ -104,7 +104,7 @@ def options(distances: bool | None) -> ImportOptions:
     return ImportOptions(grid=small_options().grid, distances=distances)
 
 
-def test_parts_get_distances_where_the_environment_wants_them(file: Path, tmp_path: Path) -> None:
+def test_import_files_distances_by_environment(file: Path, tmp_path: Path) -> None:
     import_files(tmp_path / "e.db", [file], options(distances=True))
     parts = {part.name: part for part in parse_in_process(file).parts}
     with hapticdb.open(tmp_path / "e.db") as env:
@@ -120,7 +120,7 @@ def test_parts_get_distances_where_the_environment_wants_them(file: Path, tmp_pa
             assert found.distances.data.tolist() == wanted.distances.data.tolist()
 
 
-def test_a_moved_object_keeps_its_distances(file: Path, tmp_path: Path) -> None:
+def test_move_preserves_distances(file: Path, tmp_path: Path) -> None:
     import_files(tmp_path / "e.db", [file], options(distances=True))
     with hapticdb.open(tmp_path / "e.db") as env:
         obj = env.objects()[0]
@@ -137,7 +137,7 @@ def test_a_moved_object_keeps_its_distances(file: Path, tmp_path: Path) -> None:
         assert env.touch(shell, np.eye(4)).law == hapticdb.DistanceField()
 
 
-def test_bricks_have_them_by_default_and_voxels_do_not(file: Path, tmp_path: Path) -> None:
+def test_import_files_distances_default_by_layout(file: Path, tmp_path: Path) -> None:
     grid = small_options().grid
     layouts: tuple[Layout, ...] = get_args(Layout)
     for layout in layouts:
@@ -151,7 +151,7 @@ def test_bricks_have_them_by_default_and_voxels_do_not(file: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("made_with", [False, True])
-def test_an_existing_environment_keeps_to_its_kind(
+def test_import_files_existing_distances_option(
     file: Path, tmp_path: Path, made_with: bool
 ) -> None:
     import_files(tmp_path / "e.db", [file], options(distances=made_with))
@@ -159,7 +159,7 @@ def test_an_existing_environment_keeps_to_its_kind(
         import_files(tmp_path / "e.db", [file], options(distances=not made_with))
 
 
-def test_voxels_refuse_distances(file: Path, tmp_path: Path) -> None:
+def test_import_files_voxel_layout_refuses_distances(file: Path, tmp_path: Path) -> None:
     wrong = ImportOptions(grid=small_options().grid, layout="voxel", distances=True)
     with pytest.raises(UsageError, match="the layout voxel has no distances"):
         import_files(tmp_path / "e.db", [file], wrong)
@@ -167,9 +167,7 @@ def test_voxels_refuse_distances(file: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("option", "has_them"), [("--distances", True), ("--no-distances", False)])
-def test_the_command_line_asks_for_distances(
-    file: Path, tmp_path: Path, option: str, has_them: bool
-) -> None:
+def test_import_distances_option(file: Path, tmp_path: Path, option: str, has_them: bool) -> None:
     shutil.copy(file, tmp_path / "a.obj")
     url = str(tmp_path / "e.db")
     done = CliRunner().invoke(app, ["import", url, str(tmp_path / "a.obj"), "--bits", "7", option])

@@ -73,7 +73,7 @@ def refusal(report: FileReport, kind: type[hapticdb.errors.HapticDBError]) -> st
 
 
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
-def test_every_layout_and_curve_holds_the_voxels_of_the_oracle(
+def test_import_files_voxels_equal_oracle(
     tmp_path: Path, file: Path, wanted: list[set[Voxel]], layout: Layout, curve: CurveName
 ) -> None:
     report = import_one(tmp_path / "e.db", file, small_options(curve, layout))
@@ -88,7 +88,7 @@ def test_every_layout_and_curve_holds_the_voxels_of_the_oracle(
             assert (np.diff(env.grid.encode(found)) > 0).all()
 
 
-def test_add_and_import_write_the_same_rows(tmp_path: Path, file: Path) -> None:
+def test_add_same_rows_as_import(tmp_path: Path, file: Path) -> None:
     import_one(tmp_path / "imported.db", file, small_options())
     with hapticdb.create(tmp_path / "added.db", small_grid()) as env:
         report = env.add(file)
@@ -97,7 +97,7 @@ def test_add_and_import_write_the_same_rows(tmp_path: Path, file: Path) -> None:
     assert rows_of(tmp_path / "added.db") == rows_of(tmp_path / "imported.db")
 
 
-def test_every_instance_is_an_object_of_its_own(tmp_path: Path) -> None:
+def test_import_files_instances_are_objects(tmp_path: Path) -> None:
     nodes = [
         {"name": "axle", "children": [1, 2], "translation": [0.02, 0, 0]},
         {"name": "left", "mesh": 0, "translation": [0, -0.08, 0]},
@@ -122,7 +122,7 @@ def test_every_instance_is_an_object_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["ply", "las"])
-def test_each_point_of_a_cloud_marks_its_voxel(tmp_path: Path, suffix: str) -> None:
+def test_import_files_cloud_voxels(tmp_path: Path, suffix: str) -> None:
     points = np.round(np.random.default_rng(1).uniform(-0.159, 0.159, (400, 3)), 4)
     points[:10] = np.round(points[:10], 2)  # on the voxels' borders
     cloud = write_ply if suffix == "ply" else write_las
@@ -156,7 +156,7 @@ def write_las(path: Path, points: NDArray[np.float64]) -> Path:
 
 
 @pytest.mark.parametrize("unit", ["mm", "in"])
-def test_a_unit_scales_files_that_carry_none(tmp_path: Path, unit: str) -> None:
+def test_import_files_unit(tmp_path: Path, unit: str) -> None:
     length = {"mm": 0.001, "in": 0.0254}[unit]
     block = write_obj(tmp_path / "block.obj", {"block": box((-3, -2, -1), (3, 2, 1))})
     (obj,) = import_one(tmp_path / "e.db", block, ImportOptions(unit=unit)).added
@@ -166,9 +166,7 @@ def test_a_unit_scales_files_that_carry_none(tmp_path: Path, unit: str) -> None:
         assert env.grid.edge == pytest.approx(ROOM * 6 * length)
 
 
-def test_equal_grid_options_are_accepted_and_differing_ones_refused(
-    tmp_path: Path, file: Path
-) -> None:
+def test_import_files_grid_options_of_existing(tmp_path: Path, file: Path) -> None:
     database = tmp_path / "e.db"
     import_one(database, file, small_options("hilbert", "voxel"))
     before = rows_of(database)
@@ -193,9 +191,7 @@ def test_equal_grid_options_are_accepted_and_differing_ones_refused(
     assert rows_of(database) == before
 
 
-def test_what_lies_outside_the_grid_is_named_and_nothing_of_its_file_goes_in(
-    tmp_path: Path, file: Path
-) -> None:
+def test_import_files_outside_grid_rolls_back(tmp_path: Path, file: Path) -> None:
     database = tmp_path / "e.db"
     import_one(database, file, small_options())
     before = rows_of(database)
@@ -210,7 +206,7 @@ def test_what_lies_outside_the_grid_is_named_and_nothing_of_its_file_goes_in(
     assert rows_of(database) == before
 
 
-def test_a_file_that_meets_too_many_voxels_is_refused(tmp_path: Path) -> None:
+def test_import_files_voxel_limit(tmp_path: Path) -> None:
     """A cube of 0.1 m has 600 voxels of 1 cm by its area, and 6e4 voxels of 1 mm."""
     file = write_obj(tmp_path / "a.obj", {"cube": box((0, 0, 0), (0.1, 0.1, 0.1))})
     fine = ImportOptions(grid=GridOptions(voxel_size=1e-3, bits=8), voxel_limit=59_000)
@@ -224,16 +220,14 @@ def test_a_file_that_meets_too_many_voxels_is_refused(tmp_path: Path) -> None:
         ImportOptions(voxel_limit=0)
 
 
-def test_a_surface_on_the_border_of_the_grid_is_inside(tmp_path: Path) -> None:
+def test_import_files_surface_on_grid_border(tmp_path: Path) -> None:
     whole = write_obj(tmp_path / "whole.obj", {"whole": box([-0.16] * 3, [0.16] * 3)})
     (obj,) = import_one(tmp_path / "e.db", whole, small_options()).added
     assert obj.voxels == 32**3 - 30**3
 
 
 @pytest.mark.parametrize("is_cloud", [True, False])
-def test_what_rounding_carries_over_the_border_does_not_vanish(
-    tmp_path: Path, is_cloud: bool
-) -> None:
+def test_import_files_rounding_at_border(tmp_path: Path, is_cloud: bool) -> None:
     """It is marked or refused. A file in single precision may be off by 2e-7 of a voxel."""
     if is_cloud:
         points = np.array([[0.0, 0, 0], [ORIGIN[0] - 1e-7 * SIZE, 0.05, 0.05]])
@@ -266,7 +260,7 @@ print(peak() - before)
 """
 
 
-def test_a_cube_of_two_million_voxels_an_axis_takes_no_more_memory(tmp_path: Path) -> None:
+def test_import_files_memory_independent_of_bits(tmp_path: Path) -> None:
     """The same part of 80,000 voxels at 9 and at 21 bits an axis, one after the other."""
     part = write_obj(
         tmp_path / "part.obj",
@@ -284,7 +278,7 @@ def test_a_cube_of_two_million_voxels_an_axis_takes_no_more_memory(tmp_path: Pat
             )
 
 
-def test_a_bad_file_is_skipped_and_the_others_go_in(tmp_path: Path, file: Path) -> None:
+def test_import_files_bad_file_skipped(tmp_path: Path, file: Path) -> None:
     (tmp_path / "bad.stl").write_text("no facets here")
     other = write_obj(tmp_path / "other.obj", {"one more": ball((0, 0, 0), 0.02)})
     given = [tmp_path / "bad.stl", file, tmp_path / "gone.obj", other]
@@ -299,7 +293,7 @@ def test_a_bad_file_is_skipped_and_the_others_go_in(tmp_path: Path, file: Path) 
 
 
 @pytest.mark.parametrize("ahead", [0, files.MOST_AHEAD])
-def test_a_new_grid_holds_all_files(
+def test_import_files_new_grid_encloses_all_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead: int
 ) -> None:
     monkeypatch.setattr(files, "MOST_AHEAD", ahead)
@@ -317,7 +311,7 @@ def test_a_new_grid_holds_all_files(
 
 
 @pytest.mark.parametrize("cause", ["unreadable", "outside", "interrupted"])
-def test_nothing_usable_leaves_no_database_behind(
+def test_import_files_failure_leaves_no_database(
     tmp_path: Path, file: Path, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "bad.obj").write_text("v 0 0\n")
@@ -340,7 +334,7 @@ def test_nothing_usable_leaves_no_database_behind(
     assert left_behind(tmp_path) == []
 
 
-def test_a_complete_file_is_left_as_it_is(tmp_path: Path, file: Path) -> None:
+def test_import_files_complete_file_unchanged(tmp_path: Path, file: Path) -> None:
     database = tmp_path / "e.db"
     added = import_one(database, file, small_options()).added
     before = rows_of(database)
@@ -352,7 +346,7 @@ def test_a_complete_file_is_left_as_it_is(tmp_path: Path, file: Path) -> None:
     assert rows_of(database) == before
 
 
-def test_rows_do_not_depend_on_the_number_of_jobs(tmp_path: Path) -> None:
+def test_import_files_jobs_same_rows(tmp_path: Path) -> None:
     many = write_obj(tmp_path / "many.obj", assembly(40))
     found: list[Rows] = []
     for jobs in (1, 2, 5):
@@ -362,7 +356,7 @@ def test_rows_do_not_depend_on_the_number_of_jobs(tmp_path: Path) -> None:
     assert found[0] == found[1] == found[2]
 
 
-def test_progress_grows_to_the_whole(tmp_path: Path, file: Path) -> None:
+def test_import_files_progress(tmp_path: Path, file: Path) -> None:
     seen: list[ImportProgress] = []
     (report,) = hapticdb.import_files(tmp_path / "e.db", [file], small_options(), seen.append)
     assert [p.parts_done for p in seen] == list(range(1, 8))
@@ -372,7 +366,7 @@ def test_progress_grows_to_the_whole(tmp_path: Path, file: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["car\udcff", "car\0"])
-def test_a_name_that_is_no_text_is_refused(
+def test_import_files_bad_link_name(
     name: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = read_file
@@ -387,7 +381,7 @@ def test_a_name_that_is_no_text_is_refused(
     assert not (tmp_path / "e.db").exists()
 
 
-def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
+def test_import_files_concurrent_add_and_remove(
     tmp_path: Path, file: Path, parts: list[Part], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another process removes the part after the engine has refused to add it again."""

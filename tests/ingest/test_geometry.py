@@ -15,7 +15,7 @@ from recorded_scene import write_parts
 from servers import Place
 
 
-def test_parts_are_those_of_the_file_in_the_order_asked(
+def test_parts_from_store_equal_file(
     tmp_path: Path, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On both engines; objects of one shape share its arrays."""
@@ -51,9 +51,7 @@ def test_parts_are_those_of_the_file_in_the_order_asked(
             assert all(len(one) == 1 for one in arrays.values())
 
 
-def test_a_surface_too_large_for_a_row_is_told_and_nothing_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_import_files_surface_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(geometry, "MOST_BYTES", 100)
     file = write_obj(tmp_path / "assembly.obj", assembly(2))
     with pytest.raises(hapticdb.errors.FileError, match="part 'ball 0': its surface takes"):

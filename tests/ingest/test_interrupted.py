@@ -88,7 +88,7 @@ def assert_finishes(database: Path, file: Path, undisturbed: Rows, jobs: int = 1
 
 
 @pytest.mark.parametrize("is_there", [False, True])
-def test_an_import_killed_before_its_first_object_leaves_nothing_or_an_empty_database(
+def test_import_killed_before_first_object(
     folder: Path, undisturbed: Rows, tmp_path: Path, is_there: bool
 ) -> None:
     database = tmp_path / "e.db"
@@ -103,7 +103,7 @@ def test_an_import_killed_before_its_first_object_leaves_nothing_or_an_empty_dat
     assert_finishes(database, folder / "balls.obj", undisturbed)
 
 
-def test_an_interrupted_import_run_again_ends_as_an_undisturbed_one(
+def test_import_interrupted_then_repeated_equals_undisturbed(
     folder: Path, undisturbed: Rows, tmp_path: Path
 ) -> None:
     """Ctrl-C: the process ends soon, by the signal, and folds the log into the file."""
@@ -119,7 +119,7 @@ def test_an_interrupted_import_run_again_ends_as_an_undisturbed_one(
     assert_finishes(database, folder / "balls.obj", undisturbed)
 
 
-def test_an_import_interrupted_while_it_reads_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+def test_import_interrupted_while_parsing(folder: Path, tmp_path: Path) -> None:
     """The process that parses ends with the one that is interrupted."""
     with importing(tmp_path / "e.db", folder / "balls.obj") as process:
         wait_for(process, 0)
@@ -156,7 +156,7 @@ sys.exit(main())
         (signal.SIGTERM, 143, ""),
     ],
 )
-def test_an_import_ends_at_a_signal_in_the_middle_of_a_part(
+def test_import_signal_inside_a_part(
     folder: Path, tmp_path: Path, number: signal.Signals, code: int, words: str
 ) -> None:
     command = [sys.executable, "-c", ENDLESS, "import", str(tmp_path / "e.db")]
@@ -182,9 +182,7 @@ def wait_for_parser(pid: int) -> int:
     return int(children.read_text().split()[0])
 
 
-def test_an_error_out_of_the_progress_callback_keeps_what_is_committed(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_import_files_error_in_progress_callback(folder: Path, tmp_path: Path) -> None:
     class StoppedError(Exception):
         pass
 
@@ -199,7 +197,7 @@ def test_an_error_out_of_the_progress_callback_keeps_what_is_committed(
     assert len(rows_of(database, "object")["object"]) == 4
 
 
-def test_a_later_file_of_an_interrupted_command_goes_in_when_it_is_run_again(
+def test_import_files_interrupted_then_later_file(
     tmp_path: Path,
 ) -> None:
     files = [
@@ -219,7 +217,7 @@ def test_a_later_file_of_an_interrupted_command_goes_in_when_it_is_run_again(
     assert rows_of(tmp_path / "e.db") == rows_of(tmp_path / "whole.db")
 
 
-def test_statistics_missed_by_an_interruption_are_kept_by_the_next_import(
+def test_import_files_interrupted_before_statistics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Interrupted after the last object, before the quantile vector: run again, it writes it."""

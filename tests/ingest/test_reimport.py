@@ -23,7 +23,7 @@ def file(made: Path) -> Path:
     return made / "boxes.glb"
 
 
-def test_what_was_removed_comes_back_and_is_told(run: Run, scene: Path, file: Path) -> None:
+def test_import_restores_removed_parts(run: Run, scene: Path, file: Path) -> None:
     assert run("remove", scene, "box0", "box2")[0] == 0
     out = succeeded(run("import", scene, file))
     assert "2 objects imported" in out
@@ -34,7 +34,7 @@ def test_what_was_removed_comes_back_and_is_told(run: Run, scene: Path, file: Pa
     assert "removed" not in out
 
 
-def test_what_was_removed_stays_so_when_asked(run: Run, scene: Path, file: Path) -> None:
+def test_import_keep_removed(run: Run, scene: Path, file: Path) -> None:
     assert run("remove", scene, "box0", "box2")[0] == 0
     keep = ("import", scene, file, "--keep-removed")
     out = succeeded(run(*keep))
@@ -49,7 +49,7 @@ def test_what_was_removed_stays_so_when_asked(run: Run, scene: Path, file: Path)
         assert (len(report.added), report.restored, report.still_removed) == (2, 2, 0)
 
 
-def test_what_was_never_there_is_not_held_for_removed(run: Run, tmp_path: Path) -> None:
+def test_import_new_parts_are_not_restored(run: Run, tmp_path: Path) -> None:
     """New parts of a file, an interrupted import, and parts of the same name in another file."""
     file = boxes(tmp_path / "boxes.glb", 2)
     assert run("import", "a.db", file, "--bits", 6, "--extent", 4)[0] == 0
@@ -75,7 +75,7 @@ def changed_file(folder: Path) -> Path:
     return file
 
 
-def test_a_changed_file_is_replaced_when_asked(run: Run, tmp_path: Path) -> None:
+def test_import_replace_changed_file(run: Run, tmp_path: Path) -> None:
     file = boxes(tmp_path / "boxes.glb")
     assert run("import", "a.db", file, "--bits", 6, "--extent", 3)[0] == 0
     before = rows_of(tmp_path / "a.db")
@@ -99,7 +99,7 @@ def test_a_changed_file_is_replaced_when_asked(run: Run, tmp_path: Path) -> None
     assert "nothing to do" in run("import", "a.db", file, "--replace")[1]
 
 
-def test_a_moved_object_goes_back_and_others_stay(run: Run, scene: Path, file: Path) -> None:
+def test_import_replace_moved_object(run: Run, scene: Path, file: Path) -> None:
     before = rows_of(scene)
     other = boxes(scene.parent / "other.glb", 1, side=0.05)
     assert run("import", scene, other)[0] == 0
@@ -110,7 +110,7 @@ def test_a_moved_object_goes_back_and_others_stay(run: Run, scene: Path, file: P
     assert rows_of(scene) == before
 
 
-def test_an_interrupted_replacement_goes_on(
+def test_import_replace_resumes_after_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each part is the old or the new one; the same call again ends like an undisturbed one."""
@@ -143,9 +143,7 @@ def test_an_interrupted_replacement_goes_on(
             assert np.allclose(np.ptp(obj.bounds, axis=0), 0.12)
 
 
-def test_a_part_that_would_leave_the_grid_replaces_nothing(
-    run: Run, scene: Path, file: Path
-) -> None:
+def test_import_replace_outside_grid_changes_nothing(run: Run, scene: Path, file: Path) -> None:
     mine = boxes(scene.parent / "mine.glb")
     assert run("import", scene, mine)[0] == 0
     before = rows_of(scene)

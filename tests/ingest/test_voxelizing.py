@@ -29,7 +29,7 @@ def triangles() -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
 
 @pytest.mark.parametrize("most", [1, 100])
 @pytest.mark.parametrize("given", [HUGE, triangles()], ids=["one", "many"])
-def test_pieces_give_the_bits_of_the_whole(
+def test_voxelize_pieces_equal_whole(
     given: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]", most: int
 ) -> None:
     """Each piece begins and ends within a row of a triangle."""
@@ -39,7 +39,7 @@ def test_pieces_give_the_bits_of_the_whole(
     np.testing.assert_array_equal(found.occupancy, occupancy)
 
 
-def test_pieces_are_bounded_and_tell_their_share() -> None:
+def test_voxelize_pieces_bounded_with_share() -> None:
     pieces = list(voxelize.voxelize_pieces(8 * HUGE, BITS + 3, 100))
     shares = [share for share, _, _ in pieces]
     assert len(pieces) > 5
@@ -50,7 +50,7 @@ def test_pieces_are_bounded_and_tell_their_share() -> None:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_a_piece_ends_also_where_many_triangles_meet_the_same_bricks(axis: int) -> None:
+def test_voxelize_pieces_bounded_at_coincident_triangles(axis: int) -> None:
     needle = np.full((3, 3), 3.5)
     needle[:, axis] = 0.25, 2.0**21 - 0.25, 7.0
     once = voxelize.voxelize(needle[None], 21)
@@ -61,7 +61,7 @@ def test_a_piece_ends_also_where_many_triangles_meet_the_same_bricks(axis: int) 
         np.testing.assert_array_equal(bricks[1], once[1])
 
 
-def test_a_cloud_is_marked_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pieces_of_points_equal_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.random.default_rng(1).uniform(0.0, 40.0, (1000, 1, 3))
     monkeypatch.setattr("hapticdb.ingest.voxelizing.POINTS_AT_ONCE", 300)
     found = list(pieces_of_points(points, BITS))
@@ -73,9 +73,7 @@ def test_a_cloud_is_marked_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bricks_of_pieces(pieces_of_points(points[:0], BITS), "a part").keys.shape == (0,)
 
 
-def test_a_part_that_does_not_fit_into_memory_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bricks_of_pieces_out_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hapticdb.ingest.voxelizing._MERGE_FROM", 100)
     monkeypatch.setattr("hapticdb.ingest.voxelizing.bytes_available", lambda: 50_000)
     with pytest.raises(FileError, match=r"a part: its rows take .*fewer --bits"):
@@ -88,7 +86,7 @@ def test_a_part_that_does_not_fit_into_memory_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
-def test_an_import_tells_the_share_of_a_part(
+def test_import_files_progress_share_of_part(
     tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = threading.Event()

@@ -43,7 +43,7 @@ def give(folder: Path) -> None:
 
 @pytest.mark.parametrize("spoil", [lend, give])
 @pytest.mark.parametrize("which", ["hapticdb", "cache", "home"])
-def test_a_folder_that_others_could_write_into_or_replace_is_not_used(
+def test_cache_folder_rejects_writable_by_others(
     folders: Path, which: str, spoil: Callable[[Path], None]
 ) -> None:
     first = cache_folder()
@@ -62,7 +62,7 @@ def test_a_folder_that_others_could_write_into_or_replace_is_not_used(
     assert cache_folder() == third  # processes that this one starts use it, too
 
 
-def test_a_link_is_followed_and_its_end_is_judged(folders: Path) -> None:
+def test_cache_folder_resolves_symlink(folders: Path) -> None:
     """It is resolved once: who can replace the link gains nothing."""
     real = folders / "home/elsewhere"
     (real / "hapticdb").mkdir(parents=True)
@@ -73,14 +73,14 @@ def test_a_link_is_followed_and_its_end_is_judged(folders: Path) -> None:
         assert cache_folder().is_relative_to(folders / "temporary")
 
 
-def test_a_folder_that_all_share_is_trusted_if_it_is_sticky(folders: Path) -> None:
+def test_cache_folder_accepts_sticky_folder(folders: Path) -> None:
     """As that of temporary files: nobody replaces there what is another's."""
     (folders / "home/cache").mkdir()
     (folders / "home/cache").chmod(0o1777)
     assert cache_folder() == folders / "home/cache/hapticdb"
 
 
-def test_folders_are_made_for_the_user_alone(folders: Path) -> None:
+def test_cache_folder_private_mode(folders: Path) -> None:
     (folders / "home/cache").mkdir()
     before = os.umask(0)
     try:
@@ -102,7 +102,7 @@ if len(sys.argv) == 1:
 """
 
 
-def test_a_process_without_a_folder_says_so_in_a_line_and_removes_its_own(folders: Path) -> None:
+def test_cache_folder_none_warns_and_cleans_up(folders: Path) -> None:
     cache_folder().chmod(0o777)
     (folders / f"temporary/hapticdb-{os.geteuid()}").touch()
     script = folders / "script.py"
@@ -118,9 +118,7 @@ def test_a_process_without_a_folder_says_so_in_a_line_and_removes_its_own(folder
     assert done.stderr.count("\n") == 1
 
 
-def test_a_user_without_a_home_keeps_files_among_temporary_ones(
-    folders: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cache_folder_without_home(folders: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(pwd, "getpwuid", MagicMock(side_effect=KeyError))

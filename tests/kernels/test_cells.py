@@ -28,7 +28,7 @@ STEP = st.tuples(st.booleans(), st.sampled_from(KEYS), st.integers(0, 99))
 
 @given(st.lists(STEP, max_size=60))
 @settings(deadline=None)
-def test_a_directory_is_a_dictionary_however_keys_collide(
+def test_cell_directory_equals_dict_under_collisions(
     steps: list[tuple[bool, int, int]],
 ) -> None:
     keys = np.full((3, CAPACITY), -1, dtype=np.int64)
@@ -51,9 +51,7 @@ def test_a_directory_is_a_dictionary_however_keys_collide(
 
 @given(st.integers(0, 1000), st.just(0.0) | st.floats(0.1, 16.0))
 @settings(max_examples=40)
-def test_cells_met_within_reach_are_those_of_the_boxes_around_the_points(
-    seed: int, reach: float
-) -> None:
+def test_cells_within_reach_cover_point_boxes(seed: int, reach: float) -> None:
     grid = Grid(0.01, (0.0, 0.0, 0.0), 8)
     rng = np.random.default_rng(seed)
     points = np.hstack([rng.normal(0, 0.5, (40, 3)), np.zeros((40, 3))])
@@ -74,7 +72,7 @@ def test_cells_met_within_reach_are_those_of_the_boxes_around_the_points(
     assert set(found[found >= 0].tolist()) == expected
 
 
-def test_the_clock_passes_over_what_is_wanted_and_gives_used_slots_a_second_round() -> None:
+def test_slots_to_free_second_chance() -> None:
     cells = np.array([-1, 11, 12, -1, 14, 15])  # 0 is the empty slot, 3 is free
     wanted_at = np.array([0, 5, 1, 0, 1, 1])
     used = np.array([0, 0, 1, 0, 0, 0], dtype=np.uint8)

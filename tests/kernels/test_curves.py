@@ -75,7 +75,7 @@ def cube(bits: int) -> NDArray[np.int64]:
 
 @curves
 @pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_every_voxel_of_a_small_grid_has_the_defined_key(bits: int, curve: int) -> None:
+def test_encode_small_grids_equal_definition(bits: int, curve: int) -> None:
     path = [DEFINITIONS[curve](key, bits) for key in range(8**bits)]
     assert encode(np.array(path), bits, curve).tolist() == list(range(8**bits))
     assert [tuple(v) for v in decode(np.arange(8**bits), bits, curve).tolist()] == path
@@ -84,7 +84,7 @@ def test_every_voxel_of_a_small_grid_has_the_defined_key(bits: int, curve: int) 
 @curves
 @few
 @given(bits=st.integers(1, 21), seed=st.integers(0, 2**32 - 1))
-def test_any_voxel_returns_from_its_defined_key(bits: int, seed: int, curve: int) -> None:
+def test_decode_inverts_encode(bits: int, seed: int, curve: int) -> None:
     voxels = np.random.default_rng(seed).integers(0, 1 << bits, (8, 3)).tolist()
     keys = encode(np.array(voxels), bits, curve)
     assert keys.dtype == np.int64
@@ -95,7 +95,7 @@ def test_any_voxel_returns_from_its_defined_key(bits: int, seed: int, curve: int
 
 
 @curves
-def test_the_keys_of_the_largest_grid_fill_63_bits(curve: int) -> None:
+def test_encode_largest_grid_63_bits(curve: int) -> None:
     ends = np.array([0, 2**63 - 1], dtype=np.int64)
     voxels = decode(ends, 21, curve)
     assert ((voxels >= 0) & (voxels <= LAST)).all()
@@ -106,7 +106,7 @@ def test_the_keys_of_the_largest_grid_fill_63_bits(curve: int) -> None:
 
 
 @curves
-def test_arrays_of_any_type_order_of_memory_and_length_are_taken(curve: int) -> None:
+def test_encode_any_dtype_order_length(curve: int) -> None:
     voxels = cube(3)
     keys = encode(voxels, 3, curve)
     np.testing.assert_array_equal(encode(voxels.astype(np.int32), 3, curve), keys)

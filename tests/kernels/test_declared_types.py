@@ -88,7 +88,7 @@ print(len(declared))
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without JIT none compiles")
 @pytest.mark.long
-def test_entries_are_called_with_their_declared_types_alone(tmp_path: Path) -> None:
+def test_entries_called_with_declared_types(tmp_path: Path) -> None:
     """So nothing is compiled in place: sets have the machine code of declared types.
 
     A session's loop runs in its own process and raises an error if a kernel is compiled while it

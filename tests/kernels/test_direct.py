@@ -46,7 +46,7 @@ class Tool:
 
 
 @given(wrench=NUMBERS)
-def test_the_device_gets_the_frame_s_wrench_up_to_its_caps(wrench: list[float]) -> None:
+def test_direct_wrench_of_frame_up_to_caps(wrench: list[float]) -> None:
     """Force as in the scene; the torque about the handle's origin is the scene's over the scale."""
     tool = Tool()
     found = tool.feel_long(wrench)
@@ -62,7 +62,7 @@ def test_the_device_gets_the_frame_s_wrench_up_to_its_caps(wrench: list[float]) 
     assert (int(tool.sent.hits), int(tool.sent.marks)) == (3, 0)
 
 
-def test_a_force_rises_from_zero_when_a_session_starts() -> None:
+def test_direct_force_ramps_up_from_zero() -> None:
     tool = Tool()
     rising = []
     for _ in range(30):
@@ -76,7 +76,7 @@ def test_a_force_rises_from_zero_when_a_session_starts() -> None:
 
 
 @pytest.mark.parametrize("lost", ["unknown", "stale", "nowhere"])
-def test_while_little_is_known_the_tool_stays_and_the_force_falls_to_zero(lost: str) -> None:
+def test_direct_force_fades_without_knowledge(lost: str) -> None:
     tool = Tool()
     full = tool.feel_long((0.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     before = np.array(tool.tool.position)
@@ -92,7 +92,7 @@ def test_while_little_is_known_the_tool_stays_and_the_force_falls_to_zero(lost: 
     assert int(tool.sent.unknown) == unknown
 
 
-def test_an_open_clutch_lets_the_force_fall() -> None:
+def test_direct_force_fades_with_open_clutch() -> None:
     tool = Tool()
     assert tool.feel_long((0.0, 0.0, 3.0, 0.0, 0.0, 0.0))[2] == 3.0
     tool.hand.is_open[()] = True

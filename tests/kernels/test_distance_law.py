@@ -209,7 +209,7 @@ few = settings(
     n_points=st.sampled_from([1, 2, 9, 40, 300]),
     exclude=st.lists(st.integers(1, 5), max_size=3),
 )
-def test_rows_and_cells_feel_what_plain_python_feels(
+def test_distance_law_rows_and_cells_equal_plain_python(
     curve: CurveName, seed: int, n_points: int, exclude: list[int]
 ) -> None:
     scene, shell, pose = merged(curve), random_shell(seed, n_points), random_pose(seed)
@@ -233,7 +233,7 @@ def test_rows_and_cells_feel_what_plain_python_feels(
             assert result["deepest"] == max(wanted.contact_depths.values(), default=0.0)
 
 
-def test_the_scene_has_hits_contacts_and_free_points() -> None:
+def test_distance_law_scene_covers_all_cases() -> None:
     """Else the property test would prove little."""
     scene = merged()
     found = [expected(scene, random_shell(s, 300), random_pose(s), []) for s in range(20)]
@@ -262,7 +262,7 @@ def least_distance_at(where: Array, true_distance: float) -> float:
     return total
 
 
-def test_nothing_is_felt_beyond_the_proved_distance() -> None:
+def test_distance_law_range_within_stored_band() -> None:
     """The field that is least at all 8 centres at once, at points all over a voxel's corner."""
     shares = np.linspace(0.0, 1.0, 11)
     places = np.stack(np.meshgrid(shares, shares, shares), axis=-1).reshape(-1, 3) + 10.5
@@ -300,7 +300,7 @@ UP = np.array([[0.0, 0.0, 1.0]])
 
 @given(u=st.floats(0.7, 2.7), x=st.floats(20.0, 40.0), y=st.floats(20.0, 40.0))
 @few
-def test_a_point_over_a_plane_feels_its_true_distance(u: float, x: float, y: float) -> None:
+def test_distance_law_point_over_plane(u: float, x: float, y: float) -> None:
     """F = K s (delta - u), averaged by nobody, to the accuracy of trilinear distances."""
     felt = frame(sheet(), np.array([[x, y, PLANE_AT + u]]), UP)
     assert felt[2] == pytest.approx(1000.0 * SIZE * max(1.5 - u, 0.0), abs=1000.0 * SIZE * 0.03)
@@ -310,7 +310,7 @@ def test_a_point_over_a_plane_feels_its_true_distance(u: float, x: float, y: flo
 
 
 @pytest.mark.parametrize("n_points", [4, 9, 10, 100])
-def test_a_flat_punch_is_averaged_from_ten_points_on(n_points: int) -> None:
+def test_distance_law_punch_averaged_from_ten_points(n_points: int) -> None:
     """All points at u = 1: each counts fully, and pushes K s (delta - 1)."""
     side = int(np.ceil(np.sqrt(n_points)))
     xy = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)[:n_points]
@@ -321,7 +321,7 @@ def test_a_flat_punch_is_averaged_from_ten_points_on(n_points: int) -> None:
     assert felt[2] == pytest.approx(one * n_points / max(1.0, n_points / 10), rel=0.02)
 
 
-def test_two_objects_in_one_place_push_once_and_are_both_told() -> None:
+def test_distance_law_coincident_objects_push_once() -> None:
     one = band_rows(np.array(ORIGIN) + SIZE * np.array([[[9.0, 9, 20], [40, 9, 20], [9, 40, 20]]]),
                     grid_of())  # fmt: skip
     shell = PointShell(
@@ -337,7 +337,7 @@ def test_two_objects_in_one_place_push_once_and_are_both_told() -> None:
     assert not twice[1].size, "the point is no hit"
 
 
-def test_between_two_objects_the_nearest_one_is_told() -> None:
+def test_distance_law_nearest_object_reported() -> None:
     """In a corner of two sheets the least distances interpolate lower than each of them."""
     floor = np.array([[[9.0, 9, 20], [50, 9, 20], [9, 50, 20]]])
     wall = np.array([[[20.0, 9, 9], [20, 50, 9], [20, 9, 50]]])

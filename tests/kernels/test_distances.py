@@ -71,18 +71,18 @@ def check_against_brute_force(triangles: Floats, bits: int) -> None:
 
 @few
 @given(seeds, st.sampled_from(KINDS))
-def test_every_centre_has_its_distance(seed: int, kind: str) -> None:
+def test_band_equals_brute_force(seed: int, kind: str) -> None:
     check_against_brute_force(random_triangles(seed, kind, 4 if JIT else 1, 16.0), 4)
     points = np.random.default_rng(seed).uniform(-4.0, 20.0, (1 + seed % 9, 1, 3))
     check_against_brute_force(points, 4)
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
-def test_small_grids_have_one_brick(bits: int) -> None:
+def test_band_of_small_grids(bits: int) -> None:
     check_against_brute_force(random_triangles(1, "medium", 3, 2.0**bits), bits)
 
 
-def test_triangles_far_beyond_the_grid_have_their_distance() -> None:
+def test_band_of_triangles_beyond_grid() -> None:
     far = 1e5
     sheet = np.array([[[-far, -far, 5.3], [far, -far, 5.3], [0.0, far, 5.3]]])
     check_against_brute_force(sheet, 4)
@@ -91,7 +91,7 @@ def test_triangles_far_beyond_the_grid_have_their_distance() -> None:
 
 
 @pytest.mark.parametrize("far", [1e30, 1e300])
-def test_triangles_without_measure_do_no_harm(far: float) -> None:
+def test_band_of_huge_triangles_finite(far: float) -> None:
     sheet = np.array([[[-far, -far, 5.5], [far, -far, 5.5], [0.0, far, 5.5]]])
     assert len(band_of(sheet, 5)[0]) <= 64
 
@@ -99,7 +99,7 @@ def test_triangles_without_measure_do_no_harm(far: float) -> None:
 @pytest.mark.skipif(not JIT, reason="too slow without the JIT")
 @few
 @given(seeds)
-def test_neither_order_nor_split_changes_a_bit(seed: int) -> None:
+def test_band_independent_of_order_and_split(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kinds = [random_triangles(seed, kind, 6, 140.0) for kind in KINDS]
     triangles = np.concatenate(kinds)
@@ -118,7 +118,7 @@ def test_neither_order_nor_split_changes_a_bit(seed: int) -> None:
 @pytest.mark.skipif(not JIT, reason="too slow without the JIT")
 @few
 @given(seeds)
-def test_rows_agree_where_they_share_centres(seed: int) -> None:
+def test_band_rows_agree_on_shared_centres(seed: int) -> None:
     """Also across the border of two blocks."""
     triangles = random_triangles(seed, "medium", 40, 24.0) + BLOCK - 12.0
     keys, data, ends = band_of(triangles, 7)
@@ -132,7 +132,7 @@ def test_rows_agree_where_they_share_centres(seed: int) -> None:
 
 
 @pytest.mark.skipif(not JIT, reason="too slow without the JIT")
-def test_pieces_are_bounded_and_tell_their_share() -> None:
+def test_band_pieces_bounded_with_share() -> None:
     triangles = random_triangles(3, "medium", 60, 500.0)
     pieces = list(band_pieces(triangles, 9, rows=BLOCK_BRICKS))
     keys = np.concatenate([keys for _, keys, _, _ in pieces])
@@ -146,7 +146,7 @@ def test_pieces_are_bounded_and_tell_their_share() -> None:
 
 
 @pytest.mark.skipif(not JIT, reason="too slow without the JIT")
-def test_a_piece_ends_also_within_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_band_pieces_bounded_within_block(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that an import that many triangles crowd into one block can be ended."""
     monkeypatch.setattr(distances, "TRIANGLES_AT_ONCE", 7000)
     one = random_triangles(3, "medium", 1, 40.0)
@@ -159,7 +159,7 @@ def test_a_piece_ends_also_within_a_block(monkeypatch: pytest.MonkeyPatch) -> No
         np.testing.assert_array_equal(found, alone)
 
 
-def test_nothing_has_no_rows() -> None:
+def test_band_of_no_triangles() -> None:
     keys, data, ends = band_of(np.empty((0, 3, 3)), 5)
     assert (keys.shape, data.shape, ends.shape) == ((0,), (0,), (0,))
     assert len(band_of(np.full((1, 3, 3), -50.0), 5)[0]) == 0

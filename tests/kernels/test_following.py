@@ -36,7 +36,7 @@ class Followed:
         return float(self.hand.position[0])
 
 
-def test_a_hand_moves_evenly_to_the_pose_that_arrived_and_rests_there() -> None:
+def test_followed_hand_constant_speed_then_rest() -> None:
     hand = Followed(gap_ms=40.0)
     hand.arrive(1000 * MS, 0.01)
     way = STRETCH * 40.0
@@ -45,7 +45,7 @@ def test_a_hand_moves_evenly_to_the_pose_that_arrived_and_rests_there() -> None:
     assert hand.hand.velocity[0] == 0.0
 
 
-def test_a_hand_turns_evenly_too() -> None:
+def test_followed_hand_constant_rotation() -> None:
     hand = Followed(gap_ms=40.0)
     hand.arrive(1000 * MS, 0.0, turn=0.4)
     hand.at(1000 * MS)
@@ -58,9 +58,7 @@ def test_a_hand_turns_evenly_too() -> None:
     gaps=st.lists(st.integers(5, 100), min_size=2, max_size=20),
     steps=st.lists(st.floats(0.0, 0.01), min_size=20, max_size=20),
 )
-def test_a_hand_has_no_jumps_and_never_goes_beyond_what_arrived(
-    gaps: list[int], steps: list[float]
-) -> None:
+def test_followed_hand_continuous_without_overshoot(gaps: list[int], steps: list[float]) -> None:
     hand, now, x, last = Followed(gap_ms=33.0), 1000, 0.0, 0.0
     for gap, step in zip(gaps, steps, strict=False):
         x += step
@@ -74,7 +72,7 @@ def test_a_hand_has_no_jumps_and_never_goes_beyond_what_arrived(
     assert hand.at((now + delay) * MS) == pytest.approx(x, abs=1e-12)
 
 
-def test_a_pose_that_is_being_written_is_taken_later() -> None:
+def test_followed_hand_skips_torn_pose() -> None:
     hand = Followed(gap_ms=40.0)
     hand.arrive(1000 * MS, 0.01)
     hand.slot.hand_sequence += 1

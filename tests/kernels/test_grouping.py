@@ -53,7 +53,7 @@ def as_keys(values: list[int]) -> NDArray[np.int64]:
     ends=st.one_of(st.tuples(small, small), st.tuples(large, large)),
     eighths=st.integers(1, 80),
 )
-def test_expected_rows_are_the_overlaps_over_the_widths(
+def test_gap_rows_equal_plain_definition(
     bounds: list[int], ends: tuple[int, int], eighths: int
 ) -> None:
     left, right = sorted(ends)
@@ -63,14 +63,14 @@ def test_expected_rows_are_the_overlaps_over_the_widths(
     assert found == pytest.approx(float(wanted), rel=1e-12, abs=1e-13 * eighths * len(bounds))
 
 
-def test_the_last_key_of_the_largest_grid_is_counted() -> None:
+def test_gap_rows_last_key_of_largest_grid() -> None:
     bounds = as_keys([0, LAST_KEY - 4, LAST_KEY])
     assert gap_rows(LAST_KEY - 1, LAST_KEY, bounds, 8.0) == pytest.approx(2.0)
     assert gap_rows(0, LAST_KEY, bounds, 8.0) == 16.0
     assert gap_rows(LAST_KEY, LAST_KEY, bounds, 8.0) == 0.0
 
 
-def test_no_keys_have_no_ranges() -> None:
+def test_group_by_gap_no_keys() -> None:
     none = np.empty(0, dtype=np.int64)
     lows, highs = group_by_gap(none, none, none, 500)
     assert len(lows) == len(highs) == 0
@@ -100,9 +100,7 @@ def covered(ranges: NDArray[np.int64]) -> list[int]:
 @pytest.mark.parametrize("curve", [Z_ORDER, HILBERT], ids=["z", "hilbert"])
 @few
 @given(a=corners, b=corners, finest=st.integers(0, BITS))
-def test_a_box_is_covered_by_the_cubes_that_it_meets(
-    curve: int, a: list[int], b: list[int], finest: int
-) -> None:
+def test_ranges_of_box_cover_its_cubes(curve: int, a: list[int], b: list[int], finest: int) -> None:
     """Each key is covered once. Cubes of one voxel cover the box exactly."""
     low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
     ranges = ranges_of_box(low, high, BITS, curve, finest)
@@ -119,9 +117,7 @@ def test_a_box_is_covered_by_the_cubes_that_it_meets(
 
 @few
 @given(a=corners, b=corners)
-def test_a_box_is_covered_by_a_range_a_slab_in_lexicographic_order(
-    a: list[int], b: list[int]
-) -> None:
+def test_ranges_of_box_lexicographic_slabs(a: list[int], b: list[int]) -> None:
     low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
     ranges = ranges_of_box(low, high, BITS, LEXICOGRAPHIC, 3)
     keys = covered(ranges)

@@ -71,7 +71,7 @@ def built(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return made
 
 
-def test_the_set_that_came_is_used(
+def test_code_of_shipped_set(
     folders: Folders, built: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A user's cache is not made for it."""
@@ -96,7 +96,7 @@ def test_the_set_that_came_is_used(
         ({"sources": "0"}, "those that came are for other sources"),
     ],
 )
-def test_one_that_does_not_fit_is_built_once_and_a_line_says_why(
+def test_fitting_set_mismatch_built_once(
     folders: Folders,
     built: list[Path],
     capsys: pytest.CaptureFixture[str],
@@ -116,14 +116,14 @@ def test_one_that_does_not_fit_is_built_once_and_a_line_says_why(
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{", '{"for": 1}', "\0"])
-def test_a_damaged_manifest_fits_nothing(folders: Folders, built: list[Path], content: str) -> None:
+def test_fitting_set_damaged_manifest(folders: Folders, built: list[Path], content: str) -> None:
     write_set(folders.shipped)
     (folders.shipped / "manifest.json").write_text(content)
     assert code_of(ENTRY) == b"code"
     assert built == [folders.own]
 
 
-def test_damaged_code_is_not_loaded(folders: Folders, built: list[Path]) -> None:
+def test_code_of_damaged_code(folders: Folders, built: list[Path]) -> None:
     write_set(folders.shipped)
     (folders.shipped / ENTRY).write_bytes(b"cod")
     assert code_of(ENTRY) is None
@@ -132,7 +132,7 @@ def test_damaged_code_is_not_loaded(folders: Folders, built: list[Path]) -> None
 
 @NEEDS_JIT
 @pytest.mark.parametrize("fault", ["dies", "is not there", "has no folder"])
-def test_what_cannot_be_built_is_compiled_when_it_is_called(
+def test_code_of_build_failure_compiles_in_place(
     folders: Folders,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -151,7 +151,7 @@ def test_what_cannot_be_built_is_compiled_when_it_is_called(
 
 
 @NEEDS_JIT
-def test_building_that_is_interrupted_ends_its_processes_and_leaves_nothing(
+def test_build_set_interrupted_leaves_nothing(
     folders: Folders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_building, "SERVE", "import time; time.sleep(600)")
@@ -185,7 +185,7 @@ print("numba.np.linalg" in sys.modules, rigid.__file__)
 
 
 @NEEDS_JIT
-def test_a_copy_with_its_set_needs_no_cache_and_none_of_what_numba_compiles_with(
+def test_fitting_set_shipped_needs_no_cache_or_compiler(
     tmp_path: Path,
 ) -> None:
     """As an installed wheel: else each process would start half a second later."""
@@ -210,7 +210,7 @@ class StrangerNumbers(NamedTuple):
 
 
 @NEEDS_JIT
-def test_types_of_a_users_law_are_not_looked_up_in_a_set(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_overload_users_law_compiled_in_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """They are compiled in place."""
     asked: list[str] = []
     monkeypatch.setattr("hapticdb.kernels._jit.code_of", asked.append)

@@ -45,7 +45,7 @@ PRESSED = np.array([0.0, 0.0, 1.5 * SIZE - 0.004])
 
 
 @NEEDS_JIT
-def test_a_merged_contact_with_a_plane_is_as_stiff_as_single_ones() -> None:
+def test_merged_contacts_same_stiffness_on_plane() -> None:
     """Force = stiffness times depth, to the accuracy of stored distances; no force aside."""
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
     single = hand_over(field, BROAD, PRESSED)
@@ -59,7 +59,7 @@ def test_a_merged_contact_with_a_plane_is_as_stiff_as_single_ones() -> None:
 
 
 @NEEDS_JIT
-def test_with_fewer_near_points_nothing_changes_bit_for_bit() -> None:
+def test_merged_contacts_below_threshold_same_bits() -> None:
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
     few = hand_over(field, BROAD, PRESSED, merges_from=len(BROAD) + 1)
     never = hand_over(field, BROAD, PRESSED)
@@ -68,7 +68,7 @@ def test_with_fewer_near_points_nothing_changes_bit_for_bit() -> None:
 
 
 @NEEDS_JIT
-def test_contacts_are_single_again_when_the_tool_is_lifted_and_no_force_stays() -> None:
+def test_merged_contacts_split_on_lift() -> None:
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
     hand = hand_over(field, BROAD, PRESSED, merges_from=FROM)
     press(hand, PRESSED)
@@ -82,7 +82,7 @@ def test_contacts_are_single_again_when_the_tool_is_lifted_and_no_force_stays() 
 
 @NEEDS_JIT
 @pytest.mark.parametrize("speed", [0.5, 5.0, 50.0])
-def test_no_point_passes_a_sheet_whether_its_contact_is_merged_or_not(speed: float) -> None:
+def test_merged_contacts_never_cross_sheet(speed: float) -> None:
     """A broad tilted tool is thrown at a sheet without thickness: all points stay above it."""
     field = field_of(sheet([0.0, 0.0, 1.0]), SIZE)
     start = np.array([0.0, 0.0, 0.04])

@@ -71,7 +71,7 @@ def field_of(seed: int) -> Steps:
 
 @given(st.integers(0, 2**32 - 1))
 @settings(deadline=None, max_examples=60)
-def test_no_voxel_with_a_point_in_reach_is_missed(seed: int) -> None:
+def test_near_voxels_miss_no_point_in_reach(seed: int) -> None:
     """And none is marked whose 27 centres are all out of reach."""
     values = field_of(seed)
     near, (least, stored) = near_of(values), least_distances(values)
@@ -82,9 +82,7 @@ def test_no_voxel_with_a_point_in_reach_is_missed(seed: int) -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @given(offset=st.floats(5.0, 18.0), slope=st.floats(-0.7, 0.7))
 @settings(deadline=None, max_examples=20)
-def test_beside_a_plane_exactly_the_voxels_in_reach_are_near(
-    axis: int, offset: float, slope: float
-) -> None:
+def test_near_voxels_beside_plane_exact(axis: int, offset: float, slope: float) -> None:
     """One side of a plane: the distances fall along each axis in one direction."""
     places = np.stack(np.meshgrid(*[np.arange(-0.5, 33.0)] * 3, indexing="ij"), axis=-1)
     across = np.roll([1.0, slope, -0.3], axis)
@@ -96,7 +94,7 @@ def test_beside_a_plane_exactly_the_voxels_in_reach_are_near(
     assert not near.all()
 
 
-def test_occupied_voxels_are_near_and_a_cell_without_a_mask_has_none() -> None:
+def test_near_voxels_occupied_or_without_mask() -> None:
     words = np.random.default_rng(0).integers(0, 1 << 32, 1024, dtype=np.uint32)
     far = np.full(CELL_VALUES, BEYOND, dtype=np.uint8)
     bits = (words[:, None] >> np.arange(32, dtype=np.uint32)) & 1
@@ -104,6 +102,6 @@ def test_occupied_voxels_are_near_and_a_cell_without_a_mask_has_none() -> None:
     assert not near_of(np.zeros(CELL_VALUES, dtype=np.uint8), mask=0).any()
 
 
-def test_rounding_cannot_move_a_voxel_over_the_reach() -> None:
+def test_near_voxels_rounding_within_reach() -> None:
     assert MOST_EIGHTHS * VOXELS_A_STEP / 8 < REACH - 1e-4
     assert (MOST_EIGHTHS + 1) * VOXELS_A_STEP / 8 > REACH + 1e-4

@@ -27,7 +27,7 @@ def pieces(data: NDArray[np.uint8], ends: NDArray[np.int64]) -> list[bytes]:
 
 @few
 @given(st.integers(0, 2**32 - 1))
-def test_bricks_come_back(seed: int) -> None:
+def test_pack_occupancy_round_trip(seed: int) -> None:
     held = bricks(seed)
     packed = pieces(*pack(held.reshape(-1)))
     found = unpack(b"".join(one or EMPTY for one in packed), len(held))
@@ -37,7 +37,7 @@ def test_bricks_come_back(seed: int) -> None:
 
 @few
 @given(st.integers(0, 2**32 - 1))
-def test_a_brick_takes_its_mask_and_its_bytes(seed: int) -> None:
+def test_pack_occupancy_mask_and_bytes(seed: int) -> None:
     """By the definition: bit n of the mask, then the bytes that are not 0."""
     held = bricks(seed)
     for packed, brick in zip(pieces(*pack(held.reshape(-1))), held.tolist(), strict=True):
@@ -46,7 +46,7 @@ def test_a_brick_takes_its_mask_and_its_bytes(seed: int) -> None:
         assert packed == (mask.to_bytes(MASK_BYTES, "little") + rest if mask else b"")
 
 
-def test_no_bricks_take_nothing() -> None:
+def test_pack_occupancy_no_bricks() -> None:
     data, ends = pack(np.empty(0, np.uint8))
     assert len(data) == len(ends) == 0
     assert unpack(b"", 0).size == 0
@@ -54,7 +54,7 @@ def test_no_bricks_take_nothing() -> None:
 
 @few
 @given(st.integers(0, 2**32 - 1), st.data())
-def test_missing_and_surplus_bytes_are_refused(seed: int, draw: st.DataObject) -> None:
+def test_unpack_occupancy_wrong_length(seed: int, draw: st.DataObject) -> None:
     data = pack(bricks(seed)[:6].reshape(-1))[0].tobytes()
     n_kept = draw.draw(st.integers(0, len(data) - 1))
     for wrong in (data[:n_kept], data + b"\0"):
@@ -64,7 +64,7 @@ def test_missing_and_surplus_bytes_are_refused(seed: int, draw: st.DataObject) -
 
 @few
 @given(st.binary(max_size=300), st.integers(0, 5))
-def test_any_bytes_are_bricks_or_refused(data: bytes, n_bricks: int) -> None:
+def test_unpack_occupancy_arbitrary_bytes(data: bytes, n_bricks: int) -> None:
     try:
         found = unpack(data, n_bricks)
     except ValueError:

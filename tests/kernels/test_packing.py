@@ -56,31 +56,31 @@ def check_round_trip(rows: Values) -> None:
 
 @few
 @given(seeds)
-def test_noise_and_distances_to_planes_come_back(seed: int) -> None:
+def test_pack_round_trip_noise_and_planes(seed: int) -> None:
     check_round_trip(np.concatenate([random_rows(seed), of_planes(seed, 3)]))
 
 
-def test_every_residual_comes_back() -> None:
+def test_pack_round_trip_each_residual() -> None:
     """A row of 255 but for one value has residuals of that value and its opposite."""
     rows = np.full((256, 1000), lattice.BEYOND, np.uint8)
     rows[np.arange(256), 555] = np.arange(256)
     check_round_trip(rows if JIT else rows[[0, 1, 126, 127, 128, 129, 254, 255]])
 
 
-def test_the_largest_row_fits() -> None:
+def test_pack_largest_row() -> None:
     """Residuals of 128 at every place, and masks that differ from those before."""
     x, y, z = np.indices((10, 10, 10)).reshape(3, -1)
     most = (x + y + z) % 2 * 128 + (x * 64 + y * 16 + z * 4)
     check_round_trip(most.astype(np.uint8)[None])
 
 
-def test_no_rows_are_no_bytes() -> None:
+def test_pack_no_rows() -> None:
     data, ends = pack(np.empty((0, 1000), np.uint8))
     assert (data.shape, ends.shape) == ((0,), (0,))
     assert unpack(data, ends).shape == (0, 1000)
 
 
-def test_flat_surfaces_and_nothing_cost_little() -> None:
+def test_pack_size_of_flat_surfaces() -> None:
     beyond = np.full((1, 1000), lattice.BEYOND, np.uint8)
     assert len(pack(beyond)[0]) <= 4
     assert len(pack(steps_of(np.abs(centres()[:, 1] - 3.3))[None])[0]) <= 30
@@ -88,9 +88,7 @@ def test_flat_surfaces_and_nothing_cost_little() -> None:
 
 
 @pytest.mark.parametrize("at_once", [1, 3])
-def test_a_row_does_not_depend_on_the_rows_beside_it(
-    monkeypatch: pytest.MonkeyPatch, at_once: int
-) -> None:
+def test_pack_rows_independent_of_batch(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
     rows = np.concatenate([random_rows(1), of_planes(2, 3)])
     whole = pack(rows)
     monkeypatch.setattr("hapticdb.kernels.field.packing.ROWS_AT_ONCE", at_once)
@@ -98,7 +96,7 @@ def test_a_row_does_not_depend_on_the_rows_beside_it(
         np.testing.assert_array_equal(a, b)
 
 
-def test_only_wanted_rows_are_unpacked() -> None:
+def test_unpack_wanted_rows_only() -> None:
     rows = of_planes(4, 5)
     data, ends = pack(rows)
     data[ends[1] : ends[2]] = 255  # row 2 is damaged, and not wanted
@@ -117,7 +115,7 @@ def is_read_or_told(data: Values, ends: NDArray[np.int64]) -> None:
 
 @few
 @given(seeds)
-def test_changed_bytes_are_rows_or_told(seed: int) -> None:
+def test_unpack_changed_bytes(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = np.concatenate([of_planes(seed, 2), random_rows(seed)[2:]])
     data, ends = pack(rows)
@@ -128,7 +126,7 @@ def test_changed_bytes_are_rows_or_told(seed: int) -> None:
 
 @few
 @given(st.binary(max_size=3 * MOST_ROW_BYTES), st.lists(st.integers(-(2**62), 2**62), max_size=4))
-def test_any_bytes_and_ends_are_rows_or_told(data: bytes, ends: list[int]) -> None:
+def test_unpack_arbitrary_bytes(data: bytes, ends: list[int]) -> None:
     blob = np.frombuffer(data, np.uint8)
     near = np.array([end % (len(data) + 3) for end in ends], np.int64)
     for some in (np.array(ends, np.int64), near, np.sort(near)):
@@ -136,7 +134,7 @@ def test_any_bytes_and_ends_are_rows_or_told(data: bytes, ends: list[int]) -> No
 
 
 @pytest.mark.parametrize("change", ["shorter", "longer", "bits left over"])
-def test_a_row_of_another_length_is_told(change: str) -> None:
+def test_unpack_row_of_wrong_length(change: str) -> None:
     data, ends = pack(np.full((1, 1000), lattice.BEYOND, np.uint8))
     if change == "shorter":
         data, ends = data[:-1], ends - 1

@@ -67,20 +67,20 @@ def pressed(field: Field, points: Floats, at: Floats, way: Floats, **spring: flo
 
 @pytest.mark.parametrize("size", [0.005, 0.0005, 0.000116])
 @pytest.mark.parametrize("depth", [0.002, 0.005, 0.010])
-def test_force_is_stiffness_times_depth_at_every_voxel_size(size: float, depth: float) -> None:
+def test_coupling_force_is_stiffness_times_depth(size: float, depth: float) -> None:
     at, way = np.array([0.0, 0.0, ONSET * size - depth]), np.array([0.0, 0.0, -3.0 * size - depth])
     force = pressed(field_of(plane([0.0, 0.0, 1.0]), size), punch(3, 4.0 * size), at, way).advance()
     assert force[2] == pytest.approx(1000.0 * depth, rel=0.01, abs=1000.0 * size * STORED)
     assert math.hypot(force[0], force[1]) < 1e-6
 
 
-def test_the_force_ends_at_the_cap() -> None:
+def test_coupling_force_cap() -> None:
     at, way = np.array([0.0, 0.0, -0.03]), np.array([0.0, 0.0, -0.06])
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
     assert pressed(field, punch(3, 0.004), at, way, cap=8.0).advance()[2] == pytest.approx(8.0)
 
 
-def test_the_force_is_exactly_zero_when_free() -> None:
+def test_coupling_force_zero_in_free_space() -> None:
     hand = Hand(field_of(plane([0.0, 0.0, 1.0]), SIZE), punch(3, 0.004), [0.0, 0.0, 0.03])
     assert (hand.advance() == 0.0).all()
     hand.move([0.0, 0.0, 0.0])
@@ -94,9 +94,7 @@ def test_the_force_is_exactly_zero_when_free() -> None:
 @NEEDS_JIT
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0.087, 0, 1), (0.364, 0, 1), (1, 0, 1), (3, -2, 4)])
 @pytest.mark.parametrize("n_across", [3, 10])
-def test_force_along_a_plane_has_little_ripple(
-    normal: tuple[float, float, float], n_across: int
-) -> None:
+def test_coupling_plane_ripple(normal: tuple[float, float, float], n_across: int) -> None:
     up = unit(normal)
     along = unit(np.cross(up, [1.0, 0.3, 0.1]))
     field, points = field_of(plane(up), SIZE), punch(n_across, 0.015 / n_across)
@@ -113,7 +111,7 @@ def test_force_along_a_plane_has_little_ripple(
 
 @NEEDS_JIT
 @pytest.mark.parametrize("size", [0.005, 0.0005])
-def test_a_convex_edge_is_smooth_and_pushes_outward(size: float) -> None:
+def test_coupling_convex_edge_smooth_and_outward(size: float) -> None:
     """The hand goes round a right angle at constant depth below the surface of contact."""
     depth = 0.3 * size
     reach = ONSET * size - depth
@@ -137,9 +135,7 @@ def test_a_convex_edge_is_smooth_and_pushes_outward(size: float) -> None:
 @NEEDS_JIT
 @pytest.mark.parametrize("size", [0.005, 0.0005])
 @pytest.mark.parametrize("n_across", [1, 3])
-def test_a_corner_is_stable_and_no_force_changes_faster_than_the_hand(
-    size: float, n_across: int
-) -> None:
+def test_coupling_corner_stable(size: float, n_across: int) -> None:
     """Gauss-Newton alone overshoots here as soon as force over voxel size exceeds stiffness."""
     hand = Hand(
         field_of(corner(), size), punch(n_across, 0.5 * size), [6.0 * size, 0.0, 6.0 * size],
@@ -157,7 +153,7 @@ def test_a_corner_is_stable_and_no_force_changes_faster_than_the_hand(
 
 
 @NEEDS_JIT
-def test_a_pose_in_a_corner_has_the_least_energy() -> None:
+def test_coupling_corner_least_energy() -> None:
     """Against a general minimiser of the same energy over the same spline."""
     points, target = punch(3, 0.004), np.array([-0.001, 0.0005, 0.0005])
     field = field_of(corner(), SIZE)
@@ -199,7 +195,7 @@ def slot_in(field: Field, cell: tuple[int, ...]) -> int:
 
 
 @NEEDS_JIT
-def test_every_scale_gives_the_same_wrench() -> None:
+def test_coupling_wrench_scale_invariant() -> None:
     wrenches = []
     for scale in (1.0, 0.1, 100.0):
         hand = Hand(
@@ -220,7 +216,7 @@ def test_every_scale_gives_the_same_wrench() -> None:
 
 
 @NEEDS_JIT
-def test_damping_works_along_the_force_and_never_pulls() -> None:
+def test_coupling_damping_along_force_never_pulls() -> None:
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
     forces = []
     for damping in (0.0, 20.0):
@@ -236,7 +232,7 @@ def test_damping_works_along_the_force_and_never_pulls() -> None:
 
 @NEEDS_JIT
 @pytest.mark.parametrize(("frequency", "acts"), [(40.0, True), (3.0, False)])
-def test_the_guard_softens_a_force_that_shakes(frequency: float, acts: bool) -> None:
+def test_coupling_guard_softens_oscillation(frequency: float, acts: bool) -> None:
     hand = Hand(field_of(plane([0.0, 0.0, 1.0]), SIZE), punch(3, 0.004), [0.0, 0.0, 0.02])
     hand.advance()
     flags = 0
@@ -248,7 +244,7 @@ def test_the_guard_softens_a_force_that_shakes(frequency: float, acts: bool) -> 
 
 
 @NEEDS_JIT
-def test_a_tool_stays_before_unknown_cells_and_its_force_fades() -> None:
+def test_coupling_stops_at_unknown_cells() -> None:
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE, (4, 1, 4))
     at, way = np.array([0.0, 0.0, 0.004]), np.array([0.0, 0.0, -0.02])
     hand = pressed(field, punch(3, 0.004), at, way)
@@ -315,13 +311,13 @@ def walls(n_walls: int, n_tools: int, seed: int) -> list[float]:
 
 
 @NEEDS_JIT
-def test_no_tool_passes_a_sheet_or_a_plate() -> None:
+def test_coupling_never_crosses_sheet_or_plate() -> None:
     assert min(walls(8, 8, 1)) > 0.9
 
 
 @NEEDS_JIT
 @pytest.mark.long
-def test_no_tool_of_hundreds_passes_a_sheet_or_a_plate() -> None:
+def test_coupling_many_tools_never_cross_sheet_or_plate() -> None:
     assert min(walls(200 if is_every() else 40, 10, 2)) > 0.9
 
 
@@ -335,7 +331,7 @@ def globe(radius: float) -> Floats:
 
 @NEEDS_JIT
 @pytest.mark.parametrize("seed", range(6))
-def test_a_tool_astride_a_sheet_comes_free_without_a_step_and_is_then_held(seed: int) -> None:
+def test_coupling_tool_across_sheet_comes_free_smoothly(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size, normal = (0.005, 0.0005)[seed % 2], unit(rng.normal(size=3))
     start = rng.uniform(-2.5, 2.5) * size * normal
@@ -353,7 +349,7 @@ def test_a_tool_astride_a_sheet_comes_free_without_a_step_and_is_then_held(seed:
 
 @NEEDS_JIT
 @pytest.mark.parametrize("clearance", [0.05, 0.5])
-def test_a_peg_moves_freely_in_a_hole_with_a_clearance(clearance: float) -> None:
+def test_coupling_peg_free_within_clearance(clearance: float) -> None:
     size, radius = 0.001, 0.010
     angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(40)], axis=1)
@@ -370,7 +366,7 @@ def test_a_peg_moves_freely_in_a_hole_with_a_clearance(clearance: float) -> None
 
 @NEEDS_JIT
 @pytest.mark.parametrize("size", [0.005, 0.0005])
-def test_the_force_changes_softly_when_the_tool_snaps_off_an_edge(size: float) -> None:
+def test_coupling_snap_off_edge_bounded_steps(size: float) -> None:
     """The hand goes out through the side of a right angle, deep below its top."""
     slope, down = unit([1.0, 0.0, 1.0]), unit([1.0, 0.0, -1.0])  # of the face on the left
     start = -6.0 * size * slope + (2.5 - ONSET) * size * down
@@ -390,7 +386,7 @@ def test_the_force_changes_softly_when_the_tool_snaps_off_an_edge(size: float) -
 
 @NEEDS_JIT
 @pytest.mark.parametrize("ground", ["plane", "corner"])
-def test_a_hand_that_rests_on_a_surface_never_gains_energy(ground: str) -> None:
+def test_coupling_passive_at_rest(ground: str) -> None:
     """A mass of a light grip, pressed on with 3 N; the maximum of energy of each window falls."""
     mass, grip, stiffness, dt, pieces = 0.1, 1.0, 1000.0, 1e-3, 10
     up = np.array([0.0, 0.0, 1.0]) if ground == "plane" else unit([1.0, 0.0, 1.0])
@@ -418,7 +414,7 @@ def test_a_hand_that_rests_on_a_surface_never_gains_energy(ground: str) -> None:
 
 
 @NEEDS_JIT
-def test_runs_that_are_tested_by_their_spheres_change_no_force() -> None:
+def test_coupling_bounding_spheres_same_forces() -> None:
     """A broad tool comes from afar, slides, and leaves, over a plane and a cylinder."""
     points = punch(40, 0.002)
     cells = ((points - points.min(axis=0)) / np.ptp(points) * 255.0).astype(np.int64)

@@ -17,13 +17,13 @@ KEYS = st.integers(-(2**63), 2**63 - 1)
         st.integers(0, 2**10),
     )
 )
-def test_the_order_sorts_distinct_keys(keys: list[int]) -> None:
+def test_sorting_order_sorts_distinct_keys(keys: list[int]) -> None:
     array = np.array(keys, dtype=np.int64)
     assert array[sorting_order(array)].tolist() == sorted(keys)
 
 
 @given(st.lists(st.integers(0, 30)), st.integers(0, 3))
-def test_distinct_values_are_kept_ascending(values: list[int], start: int) -> None:
+def test_insert_distinct_ascending(values: list[int], start: int) -> None:
     kept = np.full(start + len(values), -7, dtype=np.int64)
     count = np.int64(0)
     for value in values:

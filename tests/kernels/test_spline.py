@@ -40,7 +40,7 @@ def read(payload: Any, x: Any, y: Any, z: Any) -> Any:  # noqa: ANN401 - numba's
 
 @given(INSIDE, INSIDE, INSIDE)
 @settings(max_examples=50)
-def test_value_and_gradient_are_those_of_the_plain_spline(x: float, y: float, z: float) -> None:
+def test_spline_value_and_gradient_equal_plain(x: float, y: float, z: float) -> None:
     found, _, _ = read(BALL, x, y, z)
     u, gradient = naive_field.spline(BALL[0], np.array([x, y, z]))
     np.testing.assert_allclose(found[0], u, atol=1e-12)
@@ -48,13 +48,13 @@ def test_value_and_gradient_are_those_of_the_plain_spline(x: float, y: float, z:
 
 
 @given(INSIDE, INSIDE, INSIDE)
-def test_no_surface_is_nearer_than_the_lower_bound(x: float, y: float, z: float) -> None:
+def test_spline_lower_bound_of_distance(x: float, y: float, z: float) -> None:
     true = abs(float(np.linalg.norm([x - 16.0, y - 16.0, z - 16.0])) - RADIUS)
     _, bound, nearest = read(BALL, x, y, z)
     assert 0.0 <= nearest <= bound <= true + 1e-12
 
 
-def test_no_surface_is_nearer_than_a_free_block_says() -> None:
+def test_bound_in_free_block_is_lower_bound() -> None:
     """Surface points leave all centres of a brick, and those around it, beyond h."""
     rng = np.random.default_rng(1)
     points = rng.uniform(-4.0, 12.0, (20_000, 3))

@@ -19,7 +19,7 @@ def line_triangle(origin: Floats, direction: Floats, triangle: Floats) -> float:
 
 @given(seed=st.integers(0, 2**32), n=st.integers(1, 40))
 @settings(max_examples=30, deadline=None)
-def test_the_tree_counts_the_crossings_of_a_plain_loop(seed: int, n: int) -> None:
+def test_crossings_equal_plain_loop(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     triangles = rng.normal(size=(n, 3, 3))
     bodies = rng.integers(0, 3, n)
@@ -40,7 +40,7 @@ def test_the_tree_counts_the_crossings_of_a_plain_loop(seed: int, n: int) -> Non
             assert tuple(found[:2]) == ((distances > 0.0).sum(), (distances < 0.0).sum())
 
 
-def test_a_line_that_starts_on_another_triangle_is_no_witness() -> None:
+def test_crossings_line_on_coincident_triangle() -> None:
     triangle = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
     tree = triangle_bvh.triangle_bvh(np.repeat(triangle, 2, axis=0), np.zeros(2, dtype=np.int64))
     stack = np.empty(triangle_bvh.STACK, dtype=np.int64)

@@ -69,7 +69,7 @@ def from_triangle(places: Floats, triangle: Floats) -> float:
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-4, 1e3])
-def test_no_pair_is_told_farther_apart_than_it_is(size: float) -> None:
+def test_nearest_triangles_bounds(size: float) -> None:
     rng = np.random.default_rng(31)
     for kind, a, b in kinds_of_pairs(rng):
         for mine, other in zip(size * a, size * b, strict=True):
@@ -85,7 +85,7 @@ def test_no_pair_is_told_farther_apart_than_it_is(size: float) -> None:
             ), kind
 
 
-def test_triangles_that_go_through_one_another_are_not_apart() -> None:
+def test_nearest_intersecting_triangles_zero() -> None:
     rng = np.random.default_rng(7)
     for _ in range(COUNT):
         mine, other = rng.normal(size=(2, 3, 3))
@@ -103,7 +103,7 @@ def brute(a: Floats, b: Floats) -> tuple[float, float]:
     return min(p.at_least[0] for p in pairs), min(p.at_most[0] for p in pairs)
 
 
-def test_two_trees_are_as_near_as_their_nearest_triangles() -> None:
+def test_nearest_of_two_trees_equals_brute_force() -> None:
     rng = np.random.default_rng(3)
     for n in range(12):
         a = np.asarray(trimesh.creation.icosphere(1, radius=1.0).triangles)[: 5 + 4 * n]
@@ -122,7 +122,7 @@ def test_two_trees_are_as_near_as_their_nearest_triangles() -> None:
         assert limited.pairs[0].tolist() == [-1, -1]
 
 
-def test_boxes_are_not_told_farther_apart_along_the_axes_of_the_turned_one() -> None:
+def test_own_gap_lower_bound_of_rotated_boxes() -> None:
     rng = np.random.default_rng(12)
     grid = np.stack(np.meshgrid(*3 * [np.linspace(0.0, 1.0, 7)]), axis=-1).reshape(-1, 3)
     n_apart = 0

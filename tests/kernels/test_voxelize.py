@@ -54,14 +54,14 @@ def random_triangles(seed: int, count: int, size: float, edge: float) -> Triangl
 
 @few
 @given(triangles)
-def test_triangles_on_the_lattice_equal_the_oracle(tris: Triangles) -> None:
+def test_voxelize_lattice_triangles_equal_oracle(tris: Triangles) -> None:
     assert voxels(tris, 3) == voxels_of_triangles(tris.tolist(), 3)
 
 
 @pytest.mark.parametrize(
     ("size", "count"), [(0.01, 300), (0.3, 300), (1, 200), (3, 100), (10, 40), (50, 6)]
 )
-def test_random_triangles_equal_the_oracle(size: float, count: int) -> None:
+def test_voxelize_random_triangles_equal_oracle(size: float, count: int) -> None:
     tris = random_triangles(7, count if JIT else 1 + count // 10, size, 64)
     for tri in tris:
         assert voxels(tri[None], 6) == voxels_of_triangles([tri.tolist()], 6)
@@ -70,7 +70,7 @@ def test_random_triangles_equal_the_oracle(size: float, count: int) -> None:
 
 @few
 @given(triangle, st.permutations(range(3)), st.integers(0, 7), st.floats(0, 1))
-def test_flattened_triangles_equal_the_oracle(
+def test_voxelize_degenerate_triangles_equal_oracle(
     tri: tuple[tuple[float, ...], ...], order: list[int], planes: int, between: float
 ) -> None:
     """Segments, points, and triangles in border planes, along the axes and oblique."""
@@ -94,7 +94,7 @@ def test_flattened_triangles_equal_the_oracle(
     st.tuples(*[st.floats(-1, 1)] * 3),
     st.permutations(range(3)),
 )
-def test_slivers_equal_the_oracle(
+def test_voxelize_slivers_equal_oracle(
     tri: tuple[tuple[float, ...], ...],
     between: float,
     exponent: int,
@@ -110,7 +110,7 @@ def test_slivers_equal_the_oracle(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_tilted_large_triangles_equal_the_oracle(seed: int) -> None:
+def test_voxelize_large_tilted_triangles_equal_oracle(seed: int) -> None:
     """They have more columns than one buffer and more bricks than a new table has room for."""
     rng = np.random.default_rng(seed)
     edge = 64.0 if JIT else 48.0
@@ -120,7 +120,7 @@ def test_tilted_large_triangles_equal_the_oracle(seed: int) -> None:
 
 @few
 @given(st.lists(st.tuples(*[st.floats(-2, 18)] * 3) | corner, max_size=30))
-def test_points_equal_the_oracle(rows: list[tuple[float, ...]]) -> None:
+def test_mark_points_equal_oracle(rows: list[tuple[float, ...]]) -> None:
     points = np.array(rows, np.float64).reshape(-1, 3)
     expected = bricks_of_voxels(voxels_of_points(rows, 4))
     keys, occupancy = mark_points(points, 4)
@@ -142,7 +142,7 @@ def touched(low: float, high: float, side: int) -> NDArray[np.int64]:
     st.tuples(*[st.integers(0, 12)] * 4),
     st.sampled_from([1, 7, 1 << 17]),
 )
-def test_wide_rectangles_mark_the_voxels_that_they_touch(
+def test_voxelize_wide_rectangles_closed_form(
     bits: int, axes: list[int], halves: tuple[int, int, int, int], most: int
 ) -> None:
     """Between two layers or within one, and their sides so, too: all is in halves of a voxel."""
@@ -161,7 +161,7 @@ def test_wide_rectangles_mark_the_voxels_that_they_touch(
 
 
 @pytest.mark.parametrize(("axis", "layer"), [(0, 0), (1, 5), (2, 6)])
-def test_a_wide_triangle_between_two_layers_marks_both(axis: int, layer: int) -> None:
+def test_voxelize_wide_triangle_between_layers(axis: int, layer: int) -> None:
     """Its corners are those of voxels, and so are points of its longest side."""
     width, height = 1024, 1024 if JIT else 4
     corners = np.array([[3, 2, layer], [3 + width, 2, layer], [3, 2 + height, layer]], np.float64)
@@ -172,7 +172,7 @@ def test_a_wide_triangle_between_two_layers_marks_both(axis: int, layer: int) ->
     np.testing.assert_array_equal(numbers(found), numbers(np.roll(expected, axis, axis=1)))
 
 
-def test_a_separation_below_the_tolerance_touches() -> None:
+def test_voxelize_touch_tolerance() -> None:
     for gap, layers in ((5e-10, {3, 4}), (2e-9, {4})):
         flat = np.array([[[2, 2, 4 + gap], [5, 2, 4 + gap], [2, 5, 4 + gap]]])
         assert {k for _, _, k in voxels(flat, 3)} == layers
@@ -181,7 +181,7 @@ def test_a_separation_below_the_tolerance_touches() -> None:
 # --- what the result does not depend on ---------------------------------------------------------
 
 
-def test_order_and_split_of_the_triangles_do_not_matter() -> None:
+def test_voxelize_independent_of_order_and_split() -> None:
     rng = np.random.default_rng(3)
     tris = np.concatenate(
         [random_triangles(n, 40 if JIT else 8, size, 64) for n, size in enumerate((0.1, 2, 9))]
@@ -199,9 +199,7 @@ def test_order_and_split_of_the_triangles_do_not_matter() -> None:
 
 @few
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.4, 3.0]))
-def test_random_triangles_at_the_far_end_of_the_largest_grid_equal_the_oracle(
-    seed: int, size: float
-) -> None:
+def test_voxelize_far_end_of_largest_grid(seed: int, size: float) -> None:
     tris = random_triangles(seed, 3, size, 8) + (2.0**21 - 8)
     found = voxels(tris, 21)
     assert voxels_of_triangles(tris.tolist(), 21, Fraction(9, 10**10)) <= found
@@ -212,7 +210,7 @@ def test_random_triangles_at_the_far_end_of_the_largest_grid_equal_the_oracle(
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_a_needle_through_the_grid_marks_what_it_passes(axis: int) -> None:
+def test_voxelize_needle_through_grid(axis: int) -> None:
     bits = 21 if JIT else 10
     needle = np.full((1, 3, 3), 3.5)
     needle[0, :, axis] = 0.25, 2.0**bits - 0.25, 7.0
@@ -221,14 +219,14 @@ def test_a_needle_through_the_grid_marks_what_it_passes(axis: int) -> None:
 
 
 @pytest.mark.parametrize("far", [1e6, 1e30, 1e300])
-def test_a_triangle_far_beyond_the_grid_is_cut_at_its_borders(far: float) -> None:
+def test_voxelize_huge_triangle_clipped(far: float) -> None:
     sheet = np.array([[[-far, -far, 5.5], [far, -far, 5.5], [0.0, far, 5.5]]])
     assert voxels(sheet, 3) == {(i, j, 5) for i in range(8) for j in range(8)}
     assert voxels(sheet + np.array([0, 0, 9.0]), 3) == set()
     assert voxels(np.full((1, 3, 3), -far), 3) == set()
 
 
-def test_no_triangles_make_no_bricks() -> None:
+def test_voxelize_no_triangles() -> None:
     keys, occupancy = voxelize(np.empty((0, 3, 3)), 10)
     assert keys.shape == (0,)
     assert occupancy.shape == (0, 64)
@@ -236,7 +234,7 @@ def test_no_triangles_make_no_bricks() -> None:
     assert brick_voxels(keys, occupancy).shape == (0, 3)
 
 
-def test_points_that_are_not_finite_or_outside_mark_nothing() -> None:
+def test_mark_points_non_finite_or_outside() -> None:
     points = np.array([[np.nan, 1, 1], [np.inf, 1, 1], [8.0, 1, 1], [-1e-9, 1, 1], [1e300] * 3])
     assert len(mark_points(points, 3)[0]) == 0
 
@@ -244,7 +242,7 @@ def test_points_that_are_not_finite_or_outside_mark_nothing() -> None:
 # --- bricks -------------------------------------------------------------------------------------
 
 
-def test_bricks_are_sorted_and_their_bits_in_z_order() -> None:
+def test_voxelize_sorted_bricks_z_order_bits() -> None:
     tris = random_triangles(5, 30 if JIT else 6, 20, 32)
     keys, occupancy = voxelize(tris, 5)
     expected = bricks_of_voxels(voxels_of_triangles(tris.tolist(), 5))

@@ -109,7 +109,7 @@ def test_sweep_envelope_of_a_machine_contains_its_links(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("tool", [box((100.0, 60.0, 40.0)), box((100.0, 60.0, 40.0))[:-2]])
-def test_sweep_envelope_of_a_straight_motion_is_two_voxels_larger(tool: Floats) -> None:
+def test_sweep_envelope_translation_two_voxels_larger(tool: Floats) -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 0.2
     part = sweep_envelope(shell_of(tool), poses, "swept", voxel=2 * MM)
@@ -134,7 +134,7 @@ def test_sweep_envelope_of_a_turn_is_a_sector() -> None:
     assert 20.0 * sector <= volume(part) <= 24.0 * (0.25 * np.pi * 102.0**2 + 4.0 * 204.0)
 
 
-def test_sweep_envelope_refuses_voxels_that_are_too_small(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sweep_envelope_voxels_too_small(monkeypatch: pytest.MonkeyPatch) -> None:
     cube, poses = shell_of(box((100.0,) * 3)), np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 1.0
     for voxel in (0.0, np.nan):

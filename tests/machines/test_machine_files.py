@@ -24,7 +24,7 @@ def mesh(file: str, scale: str = "1 1 1") -> str:
     return f'<robot><link name="a"><visual>{text}</visual></link></robot>'
 
 
-def test_a_mesh_of_a_package_is_found_beside_the_file_and_scaled(tmp_path: Path) -> None:
+def test_read_machine_urdf_package_mesh_scaled(tmp_path: Path) -> None:
     (tmp_path / "pack/meshes").mkdir(parents=True)
     (tmp_path / "pack/urdf").mkdir()
     trimesh.creation.box((10.0, 20.0, 30.0)).export(tmp_path / "pack/meshes/a.stl")
@@ -57,7 +57,7 @@ def test_a_mesh_of_a_package_is_found_beside_the_file_and_scaled(tmp_path: Path)
         (mesh("m.urdf"), "m.urdf"),
     ],
 )  # fmt: skip
-def test_a_bad_urdf_file_is_one_line(tmp_path: Path, text: str, told: str) -> None:
+def test_read_machine_bad_urdf(tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "m.urdf").write_text(text)
     with pytest.raises(FileError, match=told) as caught:
         read_machine(tmp_path / "m.urdf")
@@ -87,7 +87,7 @@ ARM = """
 """
 
 
-def test_an_mjcf_file_has_the_kinematics_of_mujoco(tmp_path: Path) -> None:
+def test_read_machine_mjcf_equals_mujoco(tmp_path: Path) -> None:
     file = tmp_path / "m.xml"
     file.write_text(ARM)
     machine = read_machine(file)
@@ -123,7 +123,7 @@ def test_an_mjcf_file_has_the_kinematics_of_mujoco(tmp_path: Path) -> None:
          "<replicate> adds over 5,000"),
     ],
 )  # fmt: skip
-def test_a_bad_mjcf_file_is_one_line(tmp_path: Path, was: str, becomes: str, told: str) -> None:
+def test_read_machine_bad_mjcf(tmp_path: Path, was: str, becomes: str, told: str) -> None:
     text = ARM.replace(was, becomes, 1)
     (tmp_path / "m.xml").write_text(text)
     with pytest.raises(FileError, match=told) as caught:
@@ -131,7 +131,7 @@ def test_a_bad_mjcf_file_is_one_line(tmp_path: Path, was: str, becomes: str, tol
     assert "\n" not in str(caught.value)
 
 
-def test_bodies_and_joints_without_names_are_told_apart(tmp_path: Path) -> None:
+def test_read_machine_mjcf_unnamed_bodies_and_joints(tmp_path: Path) -> None:
     arm = '<body pos="{} 0 0"><joint{}/><geom size="0.1"/></body>'
     arms = arm.format(1, "") + arm.format(2, ' name="joint 1"')
     text = f'<body><joint type="slide"/><geom size="0.1"/>{arms}</body>'
@@ -143,7 +143,7 @@ def test_bodies_and_joints_without_names_are_told_apart(tmp_path: Path) -> None:
     assert frozenset(machine.names[2:]) not in machine.excluded
 
 
-def test_a_mocap_body_stands_where_the_file_has_it(tmp_path: Path) -> None:
+def test_read_machine_mjcf_mocap_body(tmp_path: Path) -> None:
     text = '<body name="m" mocap="true" pos="0 0 9"><geom size="0.1"/></body>'
     (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
     machine = read_machine(tmp_path / "m.xml")
@@ -153,14 +153,14 @@ def test_a_mocap_body_stands_where_the_file_has_it(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*NaN", "error::RuntimeWarning")
 @pytest.mark.parametrize("number", ["inf", "nan"])
-def test_a_place_without_a_finite_number_is_refused(tmp_path: Path, number: str) -> None:
+def test_read_machine_mjcf_non_finite_position(tmp_path: Path, number: str) -> None:
     text = f'<body name="m" pos="{number} 0 0"><joint/><geom size="0.1"/></body>'
     (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
     with pytest.raises(FileError, match="finite"):
         read_machine(tmp_path / "m.xml")
 
 
-def test_an_srdf_file_names_the_pairs_that_are_left_out(tmp_path: Path) -> None:
+def test_read_machine_srdf_excluded_pairs(tmp_path: Path) -> None:
     (tmp_path / "m.xml").write_text(ARM)
     (tmp_path / "m.srdf").write_text(
         '<robot><disable_collisions link1="arm" link2="other"/>'
@@ -173,7 +173,7 @@ def test_an_srdf_file_names_the_pairs_that_are_left_out(tmp_path: Path) -> None:
         read_machine(tmp_path / "m.xml", tmp_path / "m.srdf")
 
 
-def test_a_joint_path_has_the_units_of_its_header(tmp_path: Path) -> None:
+def test_read_joints_units_of_header(tmp_path: Path) -> None:
     (tmp_path / "m.xml").write_text(ARM)
     machine = read_machine(tmp_path / "m.xml")
     (tmp_path / "q.csv").write_text("lift [mm],swing [deg]\n100,180\n0,90\n\n")
@@ -193,7 +193,7 @@ def test_a_joint_path_has_the_units_of_its_header(tmp_path: Path) -> None:
         ("swing\n1\nx\n", "row 1: 'x' is no number"),
     ],
 )
-def test_a_bad_joint_path_is_one_line(tmp_path: Path, text: str, told: str) -> None:
+def test_read_joints_bad_file(tmp_path: Path, text: str, told: str) -> None:
     (tmp_path / "m.xml").write_text(ARM)
     (tmp_path / "q.csv").write_text(text)
     with pytest.raises(FileError, match=told):

@@ -75,7 +75,7 @@ ARM = (
 )  # fmt: skip
 
 
-def test_an_excavators_gap_is_that_of_its_closed_form(env: Environment, tmp_path: Path) -> None:
+def test_sweep_machine_excavator_closed_form(env: Environment, tmp_path: Path) -> None:
     machine = machine_of(tmp_path, *EXCAVATOR)
     q = np.array([[1.5, 1.0], [-0.2, -1.1], [0.4, 0.9]])
     found = sweep_machine(env, machine, q, where=["wall"])
@@ -123,9 +123,7 @@ def test_sweep_machine_gaps_bound_the_closed_form_of_objects_and_links(
         assert one.at_most - one.at_least <= max(1.1e-4, 0.011 * one.at_most)
 
 
-def test_a_gantry_is_clear_by_its_closed_form_and_hits_where_it_must(
-    env: Environment, tmp_path: Path
-) -> None:
+def test_sweep_machine_gantry_closed_form(env: Environment, tmp_path: Path) -> None:
     cube = box("0.2 0.2 0.2")
     machine = machine_of(
         tmp_path, link("base"), link("bridge"), link("hook", cube),
@@ -140,7 +138,7 @@ def test_a_gantry_is_clear_by_its_closed_form_and_hits_where_it_must(
 
 
 @pytest.mark.parametrize("degrees", [350.0, 10.0 * 360.0 + 90.0])
-def test_a_thin_arm_meets_a_post_far_beyond_half_a_turn(
+def test_sweep_machine_thin_arm_beyond_half_turn(
     env: Environment, tmp_path: Path, degrees: float
 ) -> None:
     machine = machine_of(tmp_path, *ARM)
@@ -152,7 +150,7 @@ def test_a_thin_arm_meets_a_post_far_beyond_half_a_turn(
 
 
 @pytest.mark.parametrize("end", [0.0, 0.635])
-def test_sweep_machine_places_a_hit_before_all_samples_in_the_wall(
+def test_sweep_machine_hit_before_samples_in_wall(
     env: Environment, tmp_path: Path, end: float
 ) -> None:
     """The arm ends deep in the wall, or the last sample is the only one in it."""
@@ -165,9 +163,7 @@ def test_sweep_machine_places_a_hit_before_all_samples_in_the_wall(
     assert found.hits[0].fraction == pytest.approx((np.pi - met) / (np.pi - end), abs=1e-5)
 
 
-def test_a_gripper_closes_on_itself_by_a_joint_that_follows(
-    env: Environment, tmp_path: Path
-) -> None:
+def test_sweep_machine_mimic_gripper_self_collision(env: Environment, tmp_path: Path) -> None:
     finger = box("0.02 0.02 0.1")
     machine = machine_of(
         tmp_path, link("palm"), link("left", finger), link("right", finger),
@@ -185,15 +181,13 @@ def test_a_gripper_closes_on_itself_by_a_joint_that_follows(
 
 
 @pytest.mark.parametrize("rows", [1, 3])
-def test_a_machine_at_rest_has_the_gap_of_its_pose(
-    env: Environment, tmp_path: Path, rows: int
-) -> None:
+def test_sweep_machine_at_rest_gap(env: Environment, tmp_path: Path, rows: int) -> None:
     found = sweep_machine(env, machine_of(tmp_path, *ARM), np.zeros((rows, 1)), where=["wall"])
     assert (found.verdict, found.path.length) == (PathVerdict.CLEAR, 0.0)
     assert found.gap.at_least <= 1.0 <= found.gap.at_most
 
 
-def test_a_link_inside_a_closed_body_is_a_hit(env: Environment, tmp_path: Path) -> None:
+def test_sweep_machine_link_inside_body_is_hit(env: Environment, tmp_path: Path) -> None:
     base = np.eye(4)
     base[:3, 3] = 0.0, 20.0, 0.0
     found = sweep_machine(env, machine_of(tmp_path, *ARM), [[0.0], [3.0]], at=base)
@@ -203,9 +197,7 @@ def test_a_link_inside_a_closed_body_is_a_hit(env: Environment, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("overlap", [0.0, 1e-3])
-def test_a_base_on_its_floor_touches_and_a_sunk_one_overlaps(
-    env: Environment, tmp_path: Path, overlap: float
-) -> None:
+def test_sweep_machine_base_on_floor(env: Environment, tmp_path: Path, overlap: float) -> None:
     machine = machine_of(
         tmp_path, link("foot", box("0.4 0.2 0.2")), link("arm", box("0.2 0.02 0.02"), "0.3 0 0"),
         joint("turn", "foot arm", "revolute", "1 0 0"),
@@ -219,7 +211,7 @@ def test_a_base_on_its_floor_touches_and_a_sunk_one_overlaps(
     assert any("foot and arm" in note for note in found.notes)
 
 
-def test_a_joint_beyond_its_limits_is_told(env: Environment, tmp_path: Path) -> None:
+def test_sweep_machine_joint_limit_note(env: Environment, tmp_path: Path) -> None:
     limited = ARM[2].replace("continuous", "revolute").replace("<axis", '<limit upper="1"/><axis')
     found = sweep_machine(env, machine_of(tmp_path, *ARM[:2], limited), [[0.0], [1.2]])
     assert found.notes == ("joint turn is at 1.2 rad in row 1, above 1, its limit",)
@@ -230,7 +222,7 @@ def test_a_joint_beyond_its_limits_is_told(env: Environment, tmp_path: Path) -> 
     [([[np.nan]], "row 0"), ([[1.0, 2.0]], "turn"), (np.zeros((0, 1)), "rows"),
      ([[0.0], [1e300]], "row 1"), ([[1e16], [1e16 + 2.0]], "row 0")],
 )  # fmt: skip
-def test_values_that_are_none_are_refused(
+def test_sweep_machine_bad_joint_values(
     env: Environment,
     tmp_path: Path,
     q: Any,  # noqa: ANN401
@@ -240,12 +232,12 @@ def test_values_that_are_none_are_refused(
         sweep_machine(env, machine_of(tmp_path, *ARM), q)
 
 
-def test_a_machine_without_joints_is_refused(env: Environment, tmp_path: Path) -> None:
+def test_sweep_machine_without_joints(env: Environment, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no joints"):
         sweep_machine(env, machine_of(tmp_path, ARM[1]), np.zeros((1, 0)))
 
 
-def test_sweep_machine_ends_when_its_time_is_over(env: Environment, tmp_path: Path) -> None:
+def test_sweep_machine_time_limit(env: Environment, tmp_path: Path) -> None:
     found = sweep_machine(env, machine_of(tmp_path, *EXCAVATOR), [[0.0] * 2], seconds=1e-9)
     assert (found.verdict, found.gap.at_least) == (PathVerdict.NOT_DECIDED, 0.0)
 
@@ -279,7 +271,7 @@ def least_of(machine: Machine, found: Swept, n: int) -> float:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_machines_are_never_clear_where_a_sample_collides(
+def test_sweep_machine_random_never_clear_in_collision(
     env: Environment, tmp_path: Path, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -291,7 +283,7 @@ def test_random_machines_are_never_clear_where_a_sample_collides(
     assert (found.verdict is PathVerdict.HITS) or least > 0.0
 
 
-def test_bounds_of_the_motion_hold_for_random_machines(tmp_path: Path) -> None:
+def test_motion_bounds_of_random_machines(tmp_path: Path) -> None:
     """Speed and second derivative of the box's corners, by differences, in each other's frame."""
     rng = np.random.default_rng(3)
     for _ in range(10):

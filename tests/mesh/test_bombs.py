@@ -16,9 +16,7 @@ from hapticdb.mesh.formats import accessors
 from mesh_files import TRIANGLE, cause, glb_of, gltf, text
 
 
-def test_a_glTF_that_lists_itself_is_read_once(  # noqa: N802
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gltf_self_reference_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """9,000 buffers that all name the file itself once took 5.6 GB of memory."""
     n = 500
     view = {"componentType": 5126, "count": 3, "type": "VEC3"}
@@ -43,7 +41,7 @@ def test_a_glTF_that_lists_itself_is_read_once(  # noqa: N802
     assert len(read) == 1
 
 
-def test_what_no_mesh_uses_is_not_read(tmp_path: Path) -> None:
+def test_gltf_unused_data_not_read(tmp_path: Path) -> None:
     tree = json.loads(gltf({}, tmp_path / "a.gltf").read_text())
     tree["buffers"].append({"byteLength": 1 << 40, "uri": "picture.bin"})
     tree["accessors"].append({"componentType": 5126, "count": 1 << 40, "type": "VEC3"})
@@ -66,14 +64,12 @@ def test_what_no_mesh_uses_is_not_read(tmp_path: Path) -> None:
         ({"scene": 4}, "scene 4 of 1"),
     ],
 )
-def test_a_glTF_of_wrong_kinds_and_numbers_says_which(  # noqa: N802
-    tmp_path: Path, change: dict[str, Any], word: str
-) -> None:
+def test_gltf_bad_types_and_numbers(tmp_path: Path, change: dict[str, Any], word: str) -> None:
     assert word in cause(gltf(change, tmp_path / "a.gltf"))
 
 
 @pytest.mark.parametrize("suffix", [".gltf", ".glb"])
-def test_nesting_without_end_is_one_line_from_the_child(tmp_path: Path, suffix: str) -> None:
+def test_gltf_unbounded_nesting(tmp_path: Path, suffix: str) -> None:
     path = text(tmp_path / "a.gltf", '{"asset":{"version":"2.0"},"nodes":' + "[" * 100_000)
     if suffix == ".glb":
         path = glb_of(path, tmp_path / "a.glb")
@@ -94,13 +90,13 @@ def _las(tmp_path: Path, **counts: int) -> Path:
     return path
 
 
-def test_a_LAS_file_that_promises_more_than_it_holds(tmp_path: Path) -> None:  # noqa: N802
+def test_las_declared_counts_beyond_file(tmp_path: Path) -> None:
     assert len(parse_in_process(_las(tmp_path)).parts[0].vertices) == 3
     assert "points begin" in cause(_las(tmp_path, points_at=1 << 31))
     assert "points begin" in cause(_las(tmp_path, size=12))
 
 
-def test_limits_are_options_of_an_import(tmp_path: Path) -> None:
+def test_import_options_time_and_memory_limit(tmp_path: Path) -> None:
     path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" * 20_000 + "f 1 2 3\n")
     for options in ({"time_limit": 1e-3}, {"memory_limit": 1}):
         with pytest.raises(FileError, match=f"--{next(iter(options)).replace('_', '-')}"):
@@ -125,9 +121,7 @@ def _laz(path: Path, point_format: int, n_points: int) -> Path:
 
 
 @pytest.mark.parametrize("point_format", [3, 6, 10])
-def test_packed_points_of_every_kind_are_read_in_their_chunks(
-    tmp_path: Path, point_format: int
-) -> None:
+def test_las_laz_point_formats_in_chunks(tmp_path: Path, point_format: int) -> None:
     n_points = 110_000  # chunks have 50,000 points
     file = parse_in_process(_laz(tmp_path / "a.laz", point_format, n_points))
     assert len(file.parts[0].vertices) == n_points

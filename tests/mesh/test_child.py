@@ -24,7 +24,7 @@ from hapticdb.resident.table import is_alive
 from mesh_files import cause, gltf, names, text, threemf
 
 
-def test_the_child_hands_back_what_this_process_reads(tmp_path: Path) -> None:
+def test_read_file_child_equals_in_process(tmp_path: Path) -> None:
     n = 3_000
     nodes = [{"mesh": 0, "name": f"n{i}", "translation": [i, -i, 0.1 * i]} for i in range(n)]
     nodes[1]["scale"] = [0.1, 3, 1]
@@ -41,14 +41,14 @@ def test_the_child_hands_back_what_this_process_reads(tmp_path: Path) -> None:
     np.testing.assert_array_equal(here.parts[1].triangles(), there.parts[1].triangles())
 
 
-def test_a_zip_bomb_does_not_unpack_into_memory(tmp_path: Path) -> None:
+def test_read_file_zip_bomb_memory_limit(tmp_path: Path) -> None:
     filler = " " * (64 << 20)
     path = threemf(tmp_path / "bomb.3mf", f'<object id="1">{filler}</object>', "")
     assert path.stat().st_size < 200_000
     cause(path, read_file, memory_limit=32 << 20)
 
 
-def test_files_that_a_glTF_refers_to_count_once(tmp_path: Path) -> None:  # noqa: N802
+def test_bytes_beside_counts_each_gltf_file_once(tmp_path: Path) -> None:
     beside = tmp_path / "a b.bin"
     beside.write_bytes(b"\0" * 1_000_000)
     (tmp_path / "link.bin").symlink_to(beside)
@@ -98,7 +98,7 @@ def fake_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str
         ("os.write(1, b'chatter'); raise ValueError('odd\\nfile')", {}, ["odd file"]),
     ],
 )
-def test_a_parser_that_fails_ends_in_one_line(
+def test_read_file_parser_failure_one_line(
     fake_laspy: Callable[[str], Path],
     monkeypatch: pytest.MonkeyPatch,
     body: str,
@@ -112,7 +112,7 @@ def test_a_parser_that_fails_ends_in_one_line(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the limit of time ends the child")
-def test_what_a_killed_parent_leaves_ends_with_it_or_is_removed_by_the_next(
+def test_read_file_killed_parent_leaves_no_child(
     tmp_path: Path, fake_laspy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its child ends with it. Its folder is removed, but not the folder of a process that runs."""
@@ -141,7 +141,7 @@ def test_what_a_killed_parent_leaves_ends_with_it_or_is_removed_by_the_next(
     assert not Path(own).exists()
 
 
-def test_an_interrupt_leaves_no_child(
+def test_read_file_interrupt_kills_child(
     fake_laspy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started: list[Popen[bytes]] = []
@@ -156,7 +156,7 @@ def test_an_interrupt_leaves_no_child(
     assert started[0].returncode == -signal.SIGKILL
 
 
-def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_file_missing_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'cascadio"):
         read_file(text(tmp_path / "a.STEP", "ISO-10303-21;"))

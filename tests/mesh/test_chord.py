@@ -64,9 +64,7 @@ SOLIDS: dict[str, tuple[Callable[[float], Floats], Callable[[Path, float, str], 
 
 @pytest.mark.parametrize("kind", SOLIDS)
 @pytest.mark.parametrize(("unit", "chord"), [("mm", DEFAULT), ("in", 1e-4)])
-def test_the_chord_error_bounds_the_true_one_and_is_near_it(
-    tmp_path: Path, kind: str, unit: str, chord: float
-) -> None:
+def test_chord_error_bounds_true_error(tmp_path: Path, kind: str, unit: str, chord: float) -> None:
     """In each unit alike: a sphere is tessellated twice as coarse as was asked for."""
     size, (samples, write) = {"mm": 10.0, "in": 0.4}[unit], SOLIDS[kind]
     (part,) = parse_in_process(write(tmp_path / "a.step", size, unit), chord=chord).parts
@@ -83,7 +81,7 @@ def test_the_chord_error_bounds_the_true_one_and_is_near_it(
         ("reports/s13_far_mm.step", 1e-4, False),
     ],
 )
-def test_no_vertex_of_a_finer_tessellation_is_farther_away(
+def test_chord_error_bounds_finer_tessellation(
     real_files: Path, name: str, chord: float, is_over: bool
 ) -> None:
     """Not even where OpenCASCADE exceeds its tolerance ten times; then a note says so."""
@@ -95,7 +93,7 @@ def test_no_vertex_of_a_finer_tessellation_is_farther_away(
     assert any("chord error" in note for note in file.notes) == is_over
 
 
-def test_a_flat_shape_has_none_unless_it_ends_somewhere() -> None:
+def test_chord_error_of_flat_shape() -> None:
     """A tetrahedron, each face with vertices of its own, far from the origin; then without one."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + 7.3
     vertices = corners[[0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]].astype(np.float32)
@@ -108,7 +106,7 @@ def test_a_flat_shape_has_none_unless_it_ends_somewhere() -> None:
     assert chord_error(vertices, None, faces, 1e-5) == pytest.approx(1e-5, rel=0.1)
 
 
-def test_a_placement_stretches_the_chord_error_and_mesh_files_have_none(tmp_path: Path) -> None:
+def test_placed_chord_scaled_and_zero_for_meshes(tmp_path: Path) -> None:
     world = np.diag([1.0, -3.0, 2.0, 1.0])
     corners = TRIANGLE.astype(np.float64)
     part = Part("a", corners, np.array([[0, 1, 2]]), world, chord=1e-5)
@@ -117,7 +115,7 @@ def test_a_placement_stretches_the_chord_error_and_mesh_files_have_none(tmp_path
     assert part.chord == part.placed_chord == 0.0
 
 
-def test_the_digest_is_of_the_chord_error_too() -> None:
+def test_digest_depends_on_chord_error() -> None:
     corners, faces = TRIANGLE.astype(np.float64), np.array([[0, 1, 2]])
     plain, one, other = (
         Part("a", corners, faces, np.eye(4), chord=chord) for chord in (0.0, 1e-5, 2e-5)
@@ -125,7 +123,7 @@ def test_the_digest_is_of_the_chord_error_too() -> None:
     assert len({plain.digest, one.digest, other.digest}) == 3
 
 
-def test_the_child_hands_the_chord_error_back(tmp_path: Path) -> None:
+def test_read_file_chord_error_from_child(tmp_path: Path) -> None:
     path = step_files.cylinder(tmp_path / "a.step", 10.0, 20.0)
     here, there = parse_in_process(path, chord=1e-4), read_file(path, chord=1e-4)
     assert here.parts[0].chord == there.parts[0].chord > 0.0
@@ -135,14 +133,14 @@ def test_the_child_hands_the_chord_error_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("chord", [0.0, float("nan"), float("inf"), 1e-12])
 @pytest.mark.parametrize("read", [read_file, parse_in_process])
-def test_a_chord_error_out_of_range_is_refused(
+def test_read_file_chord_out_of_range(
     tmp_path: Path, chord: float, read: Callable[..., object]
 ) -> None:
     with pytest.raises(UsageError, match="chord error"):
         read(text(tmp_path / "a.step", ""), chord=chord)
 
 
-def test_what_takes_too_long_says_that_a_larger_chord_is_faster(
+def test_read_file_timeout_suggests_larger_chord(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def late(*_: object) -> None:

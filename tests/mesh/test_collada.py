@@ -21,7 +21,7 @@ def dae(folder: Path, *changes: tuple[str, str]) -> Path:
 VERTEX = '<input semantic="VERTEX" source="#v" offset="0"/>'
 
 
-def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
+def test_collada_far_positions_exact(tmp_path: Path) -> None:
     far = "5e8 0 0 500000001 0 0 500000001 1 0 5e8 1 0"
     moved = "<translate>100 0 0", "<translate>400000000.25 0 0"
     file = parse_in_process(dae(tmp_path, ("0 0 0 1 0 0 1 1 0\n0 1 0", far), moved))
@@ -30,12 +30,12 @@ def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("declared", ["undefined", "punycode", "unicode_escape"])
-def test_an_encoding_that_is_none_for_files_is_passed_over(tmp_path: Path, declared: str) -> None:
+def test_collada_unusable_encoding_ignored(tmp_path: Path, declared: str) -> None:
     head = '"1.0"?', f'"1.0" encoding="{declared}"?'
     assert len(parse_in_process(dae(tmp_path, head, ("branch", r"\ud800"))).parts) == 1
 
 
-def test_a_unit_of_a_collada_file_that_is_no_number_is_not_known(tmp_path: Path) -> None:
+def test_collada_unit_not_a_number(tmp_path: Path) -> None:
     assert not parse_in_process(dae(tmp_path, ('meter="0.01"', 'meter="0,01"'))).names_unit
     assert parse_in_process(dae(tmp_path, ('<unit meter="0.01"/>', '<unit name="m"/>'))).names_unit
 
@@ -51,9 +51,7 @@ def test_a_unit_of_a_collada_file_that_is_no_number_is_not_known(tmp_path: Path)
         ('name="x" meter="0.01"', None),
     ],
 )
-def test_a_collada_unit_that_contradicts_itself_is_told_and_may_be_given(
-    tmp_path: Path, unit: str, metres: float | None
-) -> None:
+def test_collada_contradictory_unit(tmp_path: Path, unit: str, metres: float | None) -> None:
     """A rounded one, or one of a name of its own, is believed."""
     path = text(tmp_path / "a.dae", COLLADA.replace('meter="0.01"', unit))
     file = parse_in_process(path)
@@ -66,7 +64,7 @@ def test_a_collada_unit_that_contradicts_itself_is_told_and_may_be_given(
         np.testing.assert_allclose(np.ptp(given.bounds, axis=0).max(), 0.002)
 
 
-def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path: Path) -> None:
+def test_collada_unsupported_elements_counted(tmp_path: Path) -> None:
     gone = "<instance_geometry url='#gone'/><instance_light url='#sun'/></node></node>"
     path = dae(
         tmp_path,
@@ -83,7 +81,7 @@ def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path
     )
 
 
-def test_strips_and_fans_of_a_collada_file_are_read(tmp_path: Path) -> None:
+def test_collada_strips_and_fans(tmp_path: Path) -> None:
     for kind in ("tristrips", "trifans"):
         corners = "0 1 3 2" if kind == "tristrips" else "0 1 2 3"
         content = COLLADA.replace("<triangles", f"<{kind}").replace("</triangles", f"</{kind}")
@@ -110,7 +108,7 @@ def collada_source(name: str, floats: str, stride: int = 3, start: int = 0) -> s
         ("</p></polylist>", "</p></polylist><polygons><ph><p>0 1 2</p><h/></ph></polygons>"),
     ],
 )
-def test_a_collada_geometry_may_be_written_otherwise(tmp_path: Path, old: str, new: str) -> None:
+def test_collada_equivalent_notations(tmp_path: Path, old: str, new: str) -> None:
     assert old in COLLADA
     content = COLLADA.replace(old, new).replace("<polygons>", f"<polygons>{VERTEX}")
     if "W" in new:
@@ -134,7 +132,7 @@ def test_a_collada_geometry_may_be_written_otherwise(tmp_path: Path, old: str, n
         "",
     ],
 )
-def test_a_damaged_transform_loses_what_it_places_and_no_more(tmp_path: Path, step: str) -> None:
+def test_collada_damaged_transform(tmp_path: Path, step: str) -> None:
     """Without a step, the matrix with which a skin is bound is damaged."""
     skin = "<skin source='#g'><bind_shape_matrix>1 0</bind_shape_matrix></skin></controller>"
     library = f"<library_controllers><controller id='c'>{skin}</library_controllers><library_geom"
@@ -148,7 +146,7 @@ def test_a_damaged_transform_loses_what_it_places_and_no_more(tmp_path: Path, st
 
 
 @pytest.mark.parametrize("source", ["#gone", "#c"])
-def test_a_skin_of_what_is_not_there_is_told(tmp_path: Path, source: str) -> None:
+def test_collada_skin_of_missing_source(tmp_path: Path, source: str) -> None:
     skin = f"<controller id='c'><skin source='{source}'/></controller>"
     library = f"<library_controllers>{skin}</library_controllers><library_geom"
     node = "<instance_controller url='#c'/></node></node>"
@@ -156,7 +154,7 @@ def test_a_skin_of_what_is_not_there_is_told(tmp_path: Path, source: str) -> Non
     assert file.notes[0] == "1 of its 2 placements refers to what is not there"
 
 
-def test_a_collada_accessor_says_where_positions_are(tmp_path: Path) -> None:
+def test_collada_accessor_offset_and_stride(tmp_path: Path) -> None:
     head, _, tail = COLLADA.partition('<source id="p">')
     tail = tail.partition("</source>")[2]
     places = ("7 0 0 0 7 1 0 0 7 1 1 0 7 0 1 0 7", 4, 1), ("9 9 9 0 0 0 1 0 0 1 1 0 0 1 0", 3, 3)
@@ -174,7 +172,7 @@ def test_a_collada_accessor_says_where_positions_are(tmp_path: Path) -> None:
         ("<rotate>0 0 0 90</rotate><skew>1</skew>", (5e6, 0, 0), (5e6 + 2, 2, 0)),
     ],
 )
-def test_a_collada_node_far_away_is_turned_in_64_bits(
+def test_collada_far_node_rotated_in_double_precision(
     tmp_path: Path, steps: str, low: tuple[float, ...], high: tuple[float, ...]
 ) -> None:
     content = COLLADA.replace("0.01", "1").replace("100 0 0", "5e6 0 0")
@@ -191,7 +189,7 @@ def test_a_collada_node_far_away_is_turned_in_64_bits(
         (["<skin source='#c1'>{}</skin>", "<morph source='#g' method='NORMALIZED'/>"], 0.07),
     ],
 )
-def test_a_collada_skin_is_where_it_is_bound_and_a_morph_where_its_node_is(
+def test_collada_skin_and_morph_position(
     tmp_path: Path, controllers: list[str], low: float
 ) -> None:
     bound = "<bind_shape_matrix>1 0 0 7 0 1 0 0 0 0 1 0 0 0 0 1</bind_shape_matrix>"
@@ -210,7 +208,7 @@ def test_a_collada_skin_is_where_it_is_bound_and_a_morph_where_its_node_is(
     assert "1 geometry with a" in file.notes[0]
 
 
-def test_damage_in_a_collada_file_loses_no_more_than_its_geometry(tmp_path: Path) -> None:
+def test_collada_damage_limited_to_geometry(tmp_path: Path) -> None:
     beside = {
         "an index out of range": ("<p>0 1 2</p>", "<p>0 1 9 0 1 2</p>"),
         "an empty piece": ("<triangles ", "<triangles count='0'/><triangles "),
@@ -248,9 +246,7 @@ def test_damage_in_a_collada_file_loses_no_more_than_its_geometry(tmp_path: Path
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-32", "latin-1", "gb18030"])
 @pytest.mark.parametrize("declared", ["", "utf-8", "its own"])
-def test_names_of_a_collada_file_are_read_in_the_encoding_that_they_have(
-    tmp_path: Path, encoding: str, declared: str
-) -> None:
+def test_collada_name_encoding(tmp_path: Path, encoding: str, declared: str) -> None:
     """Whatever it declares, such as gb2312 for gb18030."""
     name = "左前轮" if encoding == "gb18030" else "Größe"
     content = COLLADA.replace("branch", name)

@@ -20,7 +20,7 @@ def colours_of(path: Path) -> NDArray[np.uint8]:
     return colours
 
 
-def test_gltf_base_colours_are_light_and_an_opaque_material_has_no_alpha(tmp_path: Path) -> None:
+def test_gltf_base_colours_linear_and_alpha_mode(tmp_path: Path) -> None:
     material = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0, 1, 0.25]}}
     piece = {"attributes": {"POSITION": 0}, "indices": 1, "material": 0}
     plain = {"attributes": {"POSITION": 0}, "indices": 1, "material": 7}
@@ -35,7 +35,7 @@ def test_gltf_base_colours_are_light_and_an_opaque_material_has_no_alpha(tmp_pat
         assert parse_in_process(path).parts[0].colours is None
 
 
-def test_gltf_vertex_colours_are_averaged_over_the_corners(tmp_path: Path) -> None:
+def test_gltf_vertex_colours_averaged(tmp_path: Path) -> None:
     """Also where the file is read in another process, as users read it."""
     shades = np.array([[255, 0, 0, 255]] * 3, dtype=np.uint8)
     piece = {"attributes": {"POSITION": 0, "COLOR_0": 2}, "indices": 1}
@@ -45,7 +45,7 @@ def test_gltf_vertex_colours_are_averaged_over_the_corners(tmp_path: Path) -> No
         np.testing.assert_array_equal(colours, [RED])
 
 
-def test_obj_materials_come_from_a_file_beside_it(tmp_path: Path) -> None:
+def test_obj_material_file(tmp_path: Path) -> None:
     body = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
     faces = "usemtl pane\nf 1 2 3\nusemtl red\nf 2 3 4\nf -1 -2 -3\nusemtl none\nf 1 2 4\n"
     text(tmp_path / "m.mtl", "newmtl red\nKd 1 0 0\nmap_Kd x.png\nnewmtl pane\nKd 0 0 1\nTr 0.75\n")
@@ -59,12 +59,12 @@ def test_obj_materials_come_from_a_file_beside_it(tmp_path: Path) -> None:
         assert parse_in_process(path).parts[0].colours is None
 
 
-def test_obj_vertices_may_have_colours(tmp_path: Path) -> None:
+def test_obj_vertex_colours(tmp_path: Path) -> None:
     path = text(tmp_path / "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n")
     np.testing.assert_array_equal(colours_of(path), [RED])
 
 
-def test_3mf_triangles_take_their_own_colour_or_the_object_s(tmp_path: Path) -> None:
+def test_threemf_triangle_and_object_colours(tmp_path: Path) -> None:
     group = '<basematerials id="5"><base name="r" displaycolor="#FF0000"/>'
     group += '<base name="b" displaycolor="#0000FF40"/></basematerials>'
     two = MESH_3MF.replace("</triangles>", '<triangle v1="0" v2="2" v3="1" p1="1"/></triangles>')
@@ -86,9 +86,7 @@ def test_3mf_triangles_take_their_own_colour_or_the_object_s(tmp_path: Path) -> 
         ('<transparent opaque="RGB_ZERO"><color>1 1 1 1</color></transparent>', 1),
     ],
 )
-def test_collada_materials_are_those_of_the_placement(
-    tmp_path: Path, clearness: str, opacity: float
-) -> None:
+def test_collada_materials_of_placement(tmp_path: Path, clearness: str, opacity: float) -> None:
     effect = (
         '<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert><diffuse>'
         f"<color>1 0 0 1</color></diffuse>{clearness}</lambert></technique></profile_COMMON>"
@@ -107,7 +105,7 @@ def test_collada_materials_are_those_of_the_placement(
     assert len(found) == 4
 
 
-def test_collada_has_colours_of_corners(tmp_path: Path) -> None:
+def test_collada_corner_colours(tmp_path: Path) -> None:
     shades = (
         '<source id="c"><float_array id="ca" count="8">1 0 0 1 0 1 0 1</float_array>'
         '<technique_common><accessor source="#ca" count="2" stride="4"><param name="R"/>'
@@ -122,7 +120,7 @@ def test_collada_has_colours_of_corners(tmp_path: Path) -> None:
     assert found[3, 0] not in {0, 255}  # the triangles beside them have none
 
 
-def test_ply_has_colours_of_faces_or_of_vertices(tmp_path: Path) -> None:
+def test_ply_face_and_vertex_colours(tmp_path: Path) -> None:
     shade = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     place = "property float x\nproperty float y\nproperty float z\n"
     corners = "property list uchar int vertex_indices\n"
@@ -138,7 +136,7 @@ def test_ply_has_colours_of_faces_or_of_vertices(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, [GREEN, RED, GREEN])
 
 
-def test_a_cloud_has_the_colours_of_its_points(tmp_path: Path) -> None:
+def test_las_point_colours(tmp_path: Path) -> None:
     """Of 16 bits, or of 8 as some programs write them."""
     for most in (65535, 255):
         cloud = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))

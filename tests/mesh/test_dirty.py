@@ -100,20 +100,20 @@ def check(path: Path, expected: Reads | str, read: Callable[..., MeshFile]) -> N
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_dirty_file_reads_with_its_counts_or_is_refused(real_files: Path, name: str) -> None:
+def test_dirty_file_counts_or_refusal(real_files: Path, name: str) -> None:
     check(real_files / "dirty" / name, EXPECTED[name], parse_in_process)
 
 
-def test_every_dirty_file_has_its_expectation(real_files: Path) -> None:
+def test_dirty_files_all_expected(real_files: Path) -> None:
     assert sorted(path.name for path in (real_files / "dirty").iterdir()) == sorted(EXPECTED)
 
 
 @pytest.mark.parametrize("name", ["assimp_malformed.obj", "assimp_AllIndicesOutOfRange.gltf"])
-def test_the_child_reads_dirty_files_alike(real_files: Path, name: str) -> None:
+def test_dirty_file_in_child(real_files: Path, name: str) -> None:
     check(real_files / "dirty" / name, EXPECTED[name], read_file)
 
 
-def test_assemblies_keep_every_instance_and_share_geometry(real_files: Path) -> None:
+def test_gltf_assemblies_share_geometry(real_files: Path) -> None:
     for name, n_parts, n_shapes in (
         ("demo_vintage_car/vintage_car.glb", 200, 66),
         ("robot_lekiwi/lekiwi.glb", 42, 42),
@@ -123,7 +123,7 @@ def test_assemblies_keep_every_instance_and_share_geometry(real_files: Path) -> 
         assert len({id(part.vertices) for part in file.parts}) == n_shapes
 
 
-def test_a_laz_file_reads_as_one_cloud(real_files: Path) -> None:
+def test_las_laz_file_one_cloud(real_files: Path) -> None:
     file = parse_in_process(real_files / "pointcloud" / "lone-star.laz")
     assert file.parts[0].is_cloud
     assert n_pieces(file) == 518_862

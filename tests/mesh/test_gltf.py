@@ -12,7 +12,7 @@ from hapticdb.mesh import parse_in_process
 from mesh_files import TRIANGLE, area_and_volume, cause, gltf, names, with_arrays
 
 
-def test_a_skin_places_a_mesh_where_its_joints_are(tmp_path: Path) -> None:
+def test_gltf_skin_joints(tmp_path: Path) -> None:
     joints = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype=np.uint8)
     weights = np.array([[0.5, 0.5, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype="<f4")
     bind = np.stack([np.eye(4), np.eye(4)])
@@ -37,7 +37,7 @@ def test_a_skin_places_a_mesh_where_its_joints_are(tmp_path: Path) -> None:
     assert "a joint of its skin 0 is not in its scene" in cause(path)
 
 
-def test_a_nodes_weights_replace_its_meshs(tmp_path: Path) -> None:
+def test_gltf_node_weights_override_mesh(tmp_path: Path) -> None:
     target = np.array([[0, 0, 1]] * 3, dtype="<f4")
     piece = {"attributes": {"POSITION": 0}, "indices": 1, "targets": [{"POSITION": 2}]}
     nodes: list[dict[str, Any]] = [{"mesh": 0}, {"mesh": 0, "weights": [0.25]}]
@@ -46,7 +46,7 @@ def test_a_nodes_weights_replace_its_meshs(tmp_path: Path) -> None:
     assert [part.bounds[0, 2] for part in parse_in_process(path).parts] == [2.0, 0.25]
 
 
-def test_instances_turn_and_scale_within_their_node(tmp_path: Path) -> None:
+def test_gltf_instances_within_node(tmp_path: Path) -> None:
     turned = np.array([[0, 0, 23170, 23170]], dtype="<i2")  # a quarter turn about z, normalized
     extension = {"EXT_mesh_gpu_instancing": {"attributes": {"ROTATION": 2}}}
     tree = {"nodes": [{"mesh": 0, "translation": [1, 0, 0], "extensions": extension}]}
@@ -55,7 +55,7 @@ def test_instances_turn_and_scale_within_their_node(tmp_path: Path) -> None:
     np.testing.assert_allclose(corners, [[1, 0, 0], [1, 1, 0], [0, 0, 0]], atol=1e-4)
 
 
-def test_extensions_that_are_not_read_are_counted_or_refused(tmp_path: Path) -> None:
+def test_gltf_extensions_counted_or_refused(tmp_path: Path) -> None:
     nodes = [{"mesh": 0, "extensions": {"KHR_implicit_shapes": {}, "KHR_xmp_json_ld": {}}}] * 2
     tree: dict[str, Any] = {"nodes": nodes, "scenes": [{"nodes": [0, 1]}]}
     file = parse_in_process(gltf(tree, tmp_path / "a.gltf"))
@@ -64,7 +64,7 @@ def test_extensions_that_are_not_read_are_counted_or_refused(tmp_path: Path) -> 
     assert "requires the glTF extension KHR_implicit" in cause(gltf(tree, tmp_path / "b.gltf"))
 
 
-def test_instances_without_places_are_where_their_node_is(tmp_path: Path) -> None:
+def test_gltf_instances_without_position(tmp_path: Path) -> None:
     numbers = np.array([[1], [2]], dtype="<f4")
     extension = {"EXT_mesh_gpu_instancing": {"attributes": {"_ID": 2}}}
     tree = {"nodes": [{"mesh": 0, "extensions": extension}]}
@@ -74,7 +74,7 @@ def test_instances_without_places_are_where_their_node_is(tmp_path: Path) -> Non
     assert "the attributes of its instances are not of one length" in cause(path)
 
 
-def test_damage_beside_a_glb_files_geometry_does_not_lose_it(tmp_path: Path) -> None:
+def test_gltf_damage_beside_geometry(tmp_path: Path) -> None:
     plain: dict[str, Any] = {"attributes": {"POSITION": 0}, "indices": 1}
     trees: list[dict[str, Any]] = [
         {"meshes": [{"primitives": [plain, {"attributes": {"_X": 0}}, {"attributes": {}}]}]},
@@ -91,7 +91,7 @@ def test_damage_beside_a_glb_files_geometry_does_not_lose_it(tmp_path: Path) -> 
         assert file.defects.unsupported == (2 if n == 0 else 0)
 
 
-def test_whole_numbers_may_be_written_with_a_point_and_accessors_may_be_zeros(
+def test_gltf_float_integers_and_zero_accessors(
     tmp_path: Path,
 ) -> None:
     path = gltf({"nodes": [{"mesh": 0}]}, tmp_path / "a.gltf")
@@ -107,13 +107,13 @@ def test_whole_numbers_may_be_written_with_a_point_and_accessors_may_be_zeros(
     assert "packed numbers are not read" in cause(path)
 
 
-def test_a_mesh_without_a_node_is_told(tmp_path: Path) -> None:
+def test_gltf_mesh_without_node(tmp_path: Path) -> None:
     mesh = {"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}
     file = parse_in_process(gltf({"meshes": [mesh, mesh]}, tmp_path / "a.gltf"))
     assert file.notes == ("1 mesh is in no node and is left out",)
 
 
-def test_a_node_that_a_scene_lists_beside_its_parent_is_placed_once(tmp_path: Path) -> None:
+def test_gltf_node_listed_twice_placed_once(tmp_path: Path) -> None:
     nodes = [{"mesh": 0}, {"children": [2], "translation": [1, 0, 0]}, {"children": [0]}]
     tree = {"nodes": nodes, "scenes": [{"nodes": [0, 1, 2]}]}
     file = parse_in_process(gltf(tree, tmp_path / "a.gltf"))
@@ -121,7 +121,7 @@ def test_a_node_that_a_scene_lists_beside_its_parent_is_placed_once(tmp_path: Pa
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
-def test_a_gltf_file_of_another_encoding_is_read(tmp_path: Path, encoding: str) -> None:
+def test_gltf_text_encoding(tmp_path: Path, encoding: str) -> None:
     path = gltf({"nodes": [{"mesh": 0, "name": "NAME"}]}, tmp_path / "a.gltf")
     path.write_bytes(path.read_text().replace("NAME", "Größe").encode(encoding))
     assert names(parse_in_process(path)) == ["Größe"]

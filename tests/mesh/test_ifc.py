@@ -22,7 +22,7 @@ def by_name(file: MeshFile) -> dict[str, Part]:
     return {part.name.rsplit("/", 1)[-1]: part for part in file.parts}
 
 
-def test_read_file_products_at_their_places(tmp_path: Path) -> None:
+def test_ifc_products_placed(tmp_path: Path) -> None:
     one = Building()
     wall = one.add("IfcWall", "wall", one.shape(one.box(4000, 200, 2500)), (1.0, 2.0, 3.0))
     one.add("IfcColumn", None, one.shape(one.box(300, 300, 2500)), (0.0, 0.0, 3.0))
@@ -39,7 +39,7 @@ def test_read_file_products_at_their_places(tmp_path: Path) -> None:
     assert [part.chord for part in file.parts] == [0.0, 0.0]
 
 
-def test_read_file_openings_are_cut_and_spaces_left_out(tmp_path: Path) -> None:
+def test_ifc_openings_cut_spaces_left_out(tmp_path: Path) -> None:
     one = Building()
     wall = one.add("IfcWall", "wall", one.shape(one.box(4000, 200, 2500)), (0.0, 0.0, 3.0))
     one.opening(wall, one.shape(one.box(1000, 400, 1000)))
@@ -52,9 +52,7 @@ def test_read_file_openings_are_cut_and_spaces_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", ["IFC2X3", "IFC4X3"])
-def test_read_file_other_schemas(
-    tmp_path: Path, version: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ifc_other_schemas(tmp_path: Path, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def user(model: ifcopenshell.file) -> entity_instance:  # which IFC2X3 requires
         person = model.create_entity("IfcPerson", FamilyName="p")
         firm = model.create_entity("IfcOrganization", Name="o")
@@ -75,7 +73,7 @@ def test_read_file_other_schemas(
     assert file.notes == ("1 space is left out",)
 
 
-def test_read_file_instances_share_a_shape(tmp_path: Path) -> None:
+def test_ifc_instances_share_shape(tmp_path: Path) -> None:
     one = Building()
     shape = one.shape(one.box(300, 300, 2500))
     for n in range(2):
@@ -97,7 +95,7 @@ def mapped(one: Building, shape: entity_instance) -> entity_instance:
 
 
 @pytest.mark.parametrize("chord", [1e-3, 1e-4])
-def test_read_file_chord_error_of_curved_products(tmp_path: Path, chord: float) -> None:
+def test_ifc_chord_error_of_curved_products(tmp_path: Path, chord: float) -> None:
     one, radius = Building(), 0.1
     one.add("IfcColumn", "post", one.shape(one.cylinder(100, 2500)))
     one.add("IfcColumn", "ball", one.shape(one.sphere(100), "CSG"))
@@ -123,9 +121,7 @@ def test_read_file_chord_error_of_curved_products(tmp_path: Path, chord: float) 
         (lambda text: text[: text.index("DATA;") + 5], "it holds no triangles.*|.*cut short.*"),
     ],
 )  # fmt: skip
-def test_read_file_broken_files_are_refused_in_one_line(
-    tmp_path: Path, change: object, cause: str
-) -> None:
+def test_ifc_broken_files(tmp_path: Path, change: object, cause: str) -> None:
     assert callable(change)
     one = Building()
     one.add("IfcWall", "wall", one.shape(one.box(4000, 200, 2500)))
@@ -136,7 +132,7 @@ def test_read_file_broken_files_are_refused_in_one_line(
     assert "\n" not in str(refused.value)
 
 
-def test_read_file_without_bodies_is_refused(tmp_path: Path) -> None:
+def test_ifc_without_bodies(tmp_path: Path) -> None:
     one = Building()
     one.add("IfcSpace", "room", one.shape(one.box(3000, 3000, 2500)))
     line = one.make("IfcPolyline", Points=[one.point(0, 0, 0), one.point(1, 0, 0)])
@@ -145,7 +141,7 @@ def test_read_file_without_bodies_is_refused(tmp_path: Path) -> None:
         read_file(one.written(tmp_path / "a.ifc"))
 
 
-def test_read_file_cut_short_is_told(tmp_path: Path) -> None:
+def test_ifc_truncated_file(tmp_path: Path) -> None:
     one = Building()
     one.add("IfcWall", "wall", one.shape(one.box(4000, 200, 2500)))
     path = one.written(tmp_path / "a.ifc")
@@ -153,14 +149,14 @@ def test_read_file_cut_short_is_told(tmp_path: Path) -> None:
     assert "END-ISO-10303-21" in read_file(path).notes[0]
 
 
-def test_read_file_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ifc_missing_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = Building().written(tmp_path / "a.ifc")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"\.ifc files need more packages: .*pip install"):
         read_file(path)
 
 
-def test_import_attributes_are_kept_and_replaced(tmp_path: Path) -> None:
+def test_ifc_attributes_stored_and_replaced(tmp_path: Path) -> None:
     one = Building()
     wall = one.add("IfcWall", "wall", one.shape(one.box(4000, 200, 2500)), (0.0, 0.0, 3.0))
     path, url = one.written(tmp_path / "a.ifc"), str(tmp_path / "a.db")

@@ -17,7 +17,7 @@ from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
 # --- names and placements -------------------------------------------------------------------
 
 
-def test_every_instance_is_a_part_named_by_its_node_path(tmp_path: Path) -> None:
+def test_gltf_instances_are_parts_named_by_path(tmp_path: Path) -> None:
     tree = {
         "nodes": [
             {"name": "car", "children": [1, 2, 3], "translation": [10, 0, 0]},
@@ -35,14 +35,14 @@ def test_every_instance_is_a_part_named_by_its_node_path(tmp_path: Path) -> None
     assert len({part.digest for part in file.parts}) == 1
 
 
-def test_the_order_of_a_nodes_transforms_is_scale_rotation_translation(tmp_path: Path) -> None:
+def test_gltf_node_transform_order(tmp_path: Path) -> None:
     half = np.sqrt(0.5)
     node = {"mesh": 0, "translation": [5, 0, 0], "rotation": [0, 0, half, half], "scale": [2, 1, 1]}
     corners = parse_in_process(gltf({"nodes": [node]}, tmp_path / "a.gltf")).parts[0].triangles()[0]
     np.testing.assert_allclose(corners, [[5, 0, 0], [5, 2, 0], [4, 0, 0]], atol=1e-15)
 
 
-def test_pieces_of_one_mesh_are_one_part(tmp_path: Path) -> None:
+def test_gltf_primitives_of_a_mesh_are_one_part(tmp_path: Path) -> None:
     piece = {"attributes": {"POSITION": 0}, "indices": 1}
     lines = {"attributes": {"POSITION": 0}, "mode": 1}
     path = gltf({"meshes": [{"primitives": [piece, piece, lines]}]}, tmp_path / "pieces.gltf")
@@ -54,13 +54,13 @@ def test_pieces_of_one_mesh_are_one_part(tmp_path: Path) -> None:
     assert file.defects == Defects(unsupported=1)
 
 
-def test_what_hangs_under_a_camera_is_read(tmp_path: Path) -> None:
+def test_gltf_children_of_camera(tmp_path: Path) -> None:
     nodes = [{"name": "eye", "camera": 0, "children": [1]}, {"name": "tool", "mesh": 0}]
     tree = {"nodes": nodes, "cameras": [{"type": "perspective"}]}
     assert names(parse_in_process(gltf(tree, tmp_path / "eye.gltf"))) == ["eye/tool"]
 
 
-def test_a_glb_reads_like_its_gltf(tmp_path: Path) -> None:
+def test_glb_equals_gltf(tmp_path: Path) -> None:
     one = gltf({"nodes": [{"name": "n", "mesh": 0, "scale": [1, 2, 3]}]}, tmp_path / "one.gltf")
     other = glb_of(one, tmp_path / "other.glb")
     a, b = parse_in_process(one).parts[0], parse_in_process(other).parts[0]
@@ -68,12 +68,12 @@ def test_a_glb_reads_like_its_gltf(tmp_path: Path) -> None:
     np.testing.assert_array_equal(a.world_from_part, b.world_from_part)
 
 
-def test_names_hold_nothing_that_a_terminal_or_database_chokes_on(tmp_path: Path) -> None:
+def test_part_names_control_characters(tmp_path: Path) -> None:
     tree = {"nodes": [{"name": "a\x00b\n\ud800", "mesh": 0}]}
     assert names(parse_in_process(gltf(tree, tmp_path / "odd.gltf"))) == ["a b ?"]
 
 
-def test_objects_and_groups_of_an_obj_are_parts(tmp_path: Path) -> None:
+def test_obj_objects_and_groups_are_parts(tmp_path: Path) -> None:
     path = text(
         tmp_path / "two.obj",
         "v 0 0 0\nv 1 0 0\nv 0 1 0\no body\ng left\nusemtl a\nf 1 2 3\nusemtl b\nf 3 2 1\n"
@@ -84,14 +84,14 @@ def test_objects_and_groups_of_an_obj_are_parts(tmp_path: Path) -> None:
     assert [len(part.triangles()) for part in file.parts] == [2, 1, 1]
 
 
-def test_a_negative_obj_index_counts_from_its_own_line(tmp_path: Path) -> None:
+def test_obj_negative_indices(tmp_path: Path) -> None:
     content = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 5\nv 1 0 5\nv 0 1 5\nf -3 -2 -1\n"
     path = text(tmp_path / "relative.obj", content)
     heights = parse_in_process(path).parts[0].triangles()[:, :, 2]
     assert heights.tolist() == [[0, 0, 0], [5, 5, 5]]
 
 
-def test_each_solid_of_a_text_stl_is_a_part(tmp_path: Path) -> None:
+def test_stl_text_solids_are_parts(tmp_path: Path) -> None:
     facet = (
         "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n"
         "endfacet\n"
@@ -107,7 +107,7 @@ def test_each_solid_of_a_text_stl_is_a_part(tmp_path: Path) -> None:
     assert file.defects == Defects(empty=1)
 
 
-def test_nested_components_of_a_3mf_keep_every_instance(tmp_path: Path) -> None:
+def test_threemf_nested_components(tmp_path: Path) -> None:
     resources = f'<object id="1" name="bolt">{MESH_3MF}</object>'
     for n in range(2, 7):
         one = f'<component objectid="{n - 1}" transform="1 0 0 0 1 0 0 0 1 {n} 0 0"/>'
@@ -126,15 +126,13 @@ def test_nested_components_of_a_3mf_keep_every_instance(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("unit", "metres"), [(None, 1.0), *UNITS.items()])
-def test_a_file_without_a_unit_takes_the_one_given(
-    tmp_path: Path, unit: str | None, metres: float
-) -> None:
+def test_parse_unit_of_unitless_file(tmp_path: Path, unit: str | None, metres: float) -> None:
     path = text(tmp_path / "a.off", "OFF\n3 1 0\n0 0 0\n2 0 0\n0 4 0\n3 0 1 2\n")
     part = parse_in_process(path, unit=unit).parts[0]
     np.testing.assert_allclose(part.bounds[1], [2 * metres, 4 * metres, 0])
 
 
-def test_a_file_with_a_unit_keeps_it(tmp_path: Path) -> None:
+def test_parse_unit_of_file_wins(tmp_path: Path) -> None:
     plain = gltf({}, tmp_path / "a.gltf")
     file = parse_in_process(plain, unit="mm")
     assert file.parts[0].bounds[1].tolist() == [1, 1, 0]
@@ -150,7 +148,7 @@ def test_a_file_with_a_unit_keeps_it(tmp_path: Path) -> None:
 # --- counts of defects ------------------------------------------------------------------------
 
 
-def test_every_kind_of_bad_triangle_is_counted_and_only_sound_ones_stay(tmp_path: Path) -> None:
+def test_obj_bad_triangles_counted(tmp_path: Path) -> None:
     path = text(
         tmp_path / "bad.obj",
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nv inf 0 0\nv 9 9 9\n"
@@ -170,7 +168,7 @@ def test_every_kind_of_bad_triangle_is_counted_and_only_sound_ones_stay(tmp_path
     )
 
 
-def test_an_index_out_of_its_piece_does_not_reach_into_the_next(tmp_path: Path) -> None:
+def test_gltf_index_out_of_primitive(tmp_path: Path) -> None:
     piece = {"attributes": {"POSITION": 0}, "indices": 1}
     plain = {"attributes": {"POSITION": 2}}
     path = gltf({}, tmp_path / "reach.gltf", indices=[0, 1, 4])
@@ -183,7 +181,7 @@ def test_an_index_out_of_its_piece_does_not_reach_into_the_next(tmp_path: Path) 
     assert len(file.parts[0].triangles()) == 1
 
 
-def test_mirrored_flattened_and_scaled_placements(tmp_path: Path) -> None:
+def test_gltf_mirrored_flattened_scaled_placements(tmp_path: Path) -> None:
     places: dict[str, dict[str, list[float]]] = {
         "mirrored": {"scale": [-1, 1, 1]},
         "to a line": {"scale": [1, 0, 1]},
@@ -199,7 +197,7 @@ def test_mirrored_flattened_and_scaled_placements(tmp_path: Path) -> None:
     assert file.defects == Defects(degenerate=1, non_finite=2)
 
 
-def test_points_that_are_not_finite_are_refused_and_counted(tmp_path: Path) -> None:
+def test_ply_non_finite_points_counted(tmp_path: Path) -> None:
     head = "ply\nformat ascii 1.0\nelement vertex 3\n"
     head += "".join(f"property float {axis}\n" for axis in "xyz")
     file = parse_in_process(text(tmp_path / "a.ply", f"{head}end_header\n0 0 0\nnan 0 0\n1 2 3\n"))
@@ -218,7 +216,7 @@ COORDINATE = st.floats(-10, 10) | st.sampled_from([np.nan, np.inf])
     st.lists(st.tuples(*[st.integers(-2, 6)] * 3), max_size=20),
     st.lists(st.tuples(*[COORDINATE] * 3), min_size=1, max_size=5),
 )
-def test_what_stays_is_sound_and_everything_is_accounted_for(
+def test_clean_all_triangles_accounted_for(
     corners: list[tuple[int, int, int]], points: list[tuple[float, float, float]]
 ) -> None:
     vertices = np.array(points, dtype=np.float64)
@@ -242,7 +240,7 @@ def test_what_stays_is_sound_and_everything_is_accounted_for(
 @given(
     st.lists(st.floats(0.2, 1), min_size=3, max_size=9), st.integers(0, 8), st.sampled_from([1, -1])
 )
-def test_triangles_of_a_star_cover_it_once(radii: list[float], first: int, step: int) -> None:
+def test_triangulated_star_polygons_covered_once(radii: list[float], first: int, step: int) -> None:
     n = len(radii)
     angles = 2 * np.pi * np.arange(n) / n
     ring = np.stack([np.cos(angles), np.sin(angles), np.full(n, 1e3)], axis=1)

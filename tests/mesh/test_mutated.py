@@ -16,11 +16,11 @@ FILES = 6000 if is_every() else 600
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted as Linux counts it")
 @pytest.mark.long
-def test_damaged_files_are_read_or_refused_in_one_line() -> None:
+def test_mutated_files_read_or_refused() -> None:
     ended = finished([sys.executable, str(SCRIPT), str(FILES)], timeout=1100)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert f"{FILES:,} files" in ended.stdout
 
 
-def test_every_format_takes_part() -> None:
+def test_mutated_files_every_format() -> None:
     assert set(SUFFIXES) < set(FORMATS)

@@ -40,7 +40,7 @@ def missing(which: str, n: int = 1) -> str:
         ("gone.mtl\nmtllib gone.mtl", "gone.mtl", False),
     ],
 )
-def test_a_file_of_materials_that_cannot_be_read_is_told(
+def test_obj_missing_material_file_note(
     tmp_path: Path, line: str, which: str, is_red: bool
 ) -> None:
     folder = tmp_path / "in"
@@ -54,7 +54,7 @@ def test_a_file_of_materials_that_cannot_be_read_is_told(
     assert (file.parts[0].colours is not None) == is_red
 
 
-def test_pictures_of_materials_that_are_not_there_are_told(tmp_path: Path) -> None:
+def test_obj_missing_texture_note(tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     text(tmp_path / "in" / "there it is.png", "x")
     materials = (
@@ -65,7 +65,7 @@ def test_pictures_of_materials_that_are_not_there_are_told(tmp_path: Path) -> No
     assert file.notes == (missing("gone.png"),)
 
 
-def test_pictures_of_a_gltf_and_a_dae_that_are_not_there_are_told(tmp_path: Path) -> None:
+def test_gltf_collada_missing_texture_note(tmp_path: Path) -> None:
     text(tmp_path / "there it is.png", "x")
     uris = ["gone%20one.png", "there%20it%20is.png", "data:image/png;base64,aaaa", 3, "gone.png"]
     images: list[Any] = [*({"uri": uri} for uri in uris), {"bufferView": 0}, 7]
@@ -82,7 +82,7 @@ def test_pictures_of_a_gltf_and_a_dae_that_are_not_there_are_told(tmp_path: Path
     assert parse_in_process(path).notes == (missing("/no/gone.png"),)
 
 
-def test_other_files_of_a_step_assembly_are_told(test_data: Path | None, tmp_path: Path) -> None:
+def test_step_external_files_note(test_data: Path | None, tmp_path: Path) -> None:
     content = _step(test_data)
     named = content.replace(b"DATA;", b"DATA;\n#900=DOCUMENT_FILE('w.stp','','',#901,'',$);", 1)
     (tmp_path / "a.step").write_bytes(named)
@@ -99,7 +99,7 @@ def _step(test_data: Path | None) -> bytes:
 # --- what moves, and what is hidden -----------------------------------------------------------
 
 
-def test_nodes_that_animations_move_are_told(tmp_path: Path) -> None:
+def test_gltf_collada_animated_nodes_note(tmp_path: Path) -> None:
     targets = [
         {"node": n, "path": path} for n, path in ((0, "scale"), (0, "weights"), (7, "scale"))
     ]
@@ -115,7 +115,7 @@ def test_nodes_that_animations_move_are_told(tmp_path: Path) -> None:
     assert parse_in_process(path).notes == ("2 nodes are moved by animations, which are not read",)
 
 
-def test_hidden_nodes_of_a_dae_and_items_of_a_3mf_that_are_not_printed_are_told(
+def test_collada_threemf_hidden_items_note(
     tmp_path: Path,
 ) -> None:
     extra = "<extra><technique><visibility>0</visibility></technique></extra>"
@@ -134,9 +134,7 @@ def test_hidden_nodes_of_a_dae_and_items_of_a_3mf_that_are_not_printed_are_told(
     ("required", "named"),
     [("", ""), ("m b", ""), ("v", "http://v.example/solid/2022/01"), ("m zz", "zz")],
 )
-def test_a_3mf_that_requires_what_is_not_read_is_refused(
-    tmp_path: Path, required: str, named: str
-) -> None:
+def test_threemf_required_extensions(tmp_path: Path, required: str, named: str) -> None:
     schemas = "http://schemas.microsoft.com/3dmanufacturing"
     spaces = f'xmlns:v="http://v.example/solid/2022/01" xmlns:m="{schemas}/material/2015/02"'
     spaces += f' xmlns:b="{schemas}/beamlattice/2017/02" requiredextensions="{required}"'
@@ -147,7 +145,7 @@ def test_a_3mf_that_requires_what_is_not_read_is_refused(
         assert area_and_volume(parse_in_process(path))[0] == 0.5
 
 
-def test_an_object_of_a_3mf_with_a_mesh_and_components_keeps_both(tmp_path: Path) -> None:
+def test_threemf_object_with_mesh_and_components(tmp_path: Path) -> None:
     both = f'<object id="2" name="b">{MESH_3MF}<components><component objectid="1"/></components>'
     path = threemf(tmp_path / "a.3mf", f"{OBJECT}{both}</object>", '<item objectid="2"/>')
     assert names(parse_in_process(path)) == ["b", "b/a"]
@@ -175,9 +173,7 @@ def test_an_object_of_a_3mf_with_a_mesh_and_components_keeps_both(tmp_path: Path
         ("units: parsecs", None),
     ],
 )
-def test_a_comment_names_the_unit_unless_an_option_does(
-    tmp_path: Path, comment: str, metres: float | None
-) -> None:
+def test_ply_obj_unit_in_comment(tmp_path: Path, comment: str, metres: float | None) -> None:
     rows = "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     ply = f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex 3\n"
     ply += "".join(f"property float {axis}\n" for axis in "xyz")
@@ -200,9 +196,7 @@ def test_a_comment_names_the_unit_unless_an_option_does(
 # --- long words of STEP -----------------------------------------------------------------------
 
 
-def test_long_comments_and_names_of_a_step_file_do_no_harm(
-    test_data: Path | None, tmp_path: Path
-) -> None:
+def test_step_long_comments_and_names(test_data: Path | None, tmp_path: Path) -> None:
     content = _step(test_data)
     long = b"/* '" + b"x" * 3_000_000 + b" #1=; END-ISO-10303-21; */"
     changed = [long + content, content.replace(b"DATA;", b"DATA;" + long, 1)]
@@ -240,7 +234,7 @@ def spread(n: int = 1000) -> np.ndarray[Any, np.dtype[np.int32]]:
 
 
 @pytest.mark.parametrize("end", [ENDS.min, ENDS.max])
-def test_points_at_the_end_of_their_integers_are_lost(tmp_path: Path, end: int) -> None:
+def test_las_points_at_integer_limits(tmp_path: Path, end: int) -> None:
     """All of them, as where a northing of 5,000 km is written in millimetres; then a few."""
     integers = spread()
     integers[:, 1] = end
@@ -253,7 +247,7 @@ def test_points_at_the_end_of_their_integers_are_lost(tmp_path: Path, end: int) 
     assert note == "3 points are stuck in z at the end of 32-bit integers"
 
 
-def test_a_scale_that_is_chosen_by_the_extent_is_no_loss(tmp_path: Path) -> None:
+def test_las_scale_chosen_by_extent(tmp_path: Path) -> None:
     """The farthest points then have the greatest integers, whichever integers begin."""
     for name, low in (("a.las", ENDS.min), ("b.las", 0)):
         integers = spread()
@@ -263,7 +257,7 @@ def test_a_scale_that_is_chosen_by_the_extent_is_no_loss(tmp_path: Path) -> None
         assert parse_in_process(las(tmp_path / name, integers, 1e-8)).notes == ()
 
 
-def test_a_scale_of_nothing_or_of_a_metre_is_told(tmp_path: Path) -> None:
+def test_las_scale_zero_or_coarse(tmp_path: Path) -> None:
     line = cause(las(tmp_path / "a.las", spread(), (0.001, 0.0, 0.0)))
     assert "the scale of its y and z is 0" in line
     (note,) = parse_in_process(las(tmp_path / "b.las", spread(), (0.001, 1.0, 0.001))).notes

@@ -36,7 +36,7 @@ def geometries(draw: st.DrawFn) -> Geometry:
 
 @settings(max_examples=200, deadline=None)
 @given(geometries(), st.sampled_from([0.0, 1e-5, 5e-324]))
-def test_what_is_packed_returns_bit_for_bit(geometry: Geometry, chord: float) -> None:
+def test_pack_geometry_round_trip(geometry: Geometry, chord: float) -> None:
     """The chord error is last, so that surfaces without one are as before."""
     vertices, faces, colours = geometry
     packed = pack(vertices, faces, colours, chord)
@@ -62,7 +62,7 @@ def ball(n: int) -> tuple[Floats, Ints]:
 
 @settings(max_examples=300, deadline=None)
 @given(st.data())
-def test_damaged_bytes_are_an_error_or_another_sound_geometry(data: st.DataObject) -> None:
+def test_unpack_geometry_damaged_bytes(data: st.DataObject) -> None:
     """Never a position that is no number, nor a triangle of a vertex that is not there."""
     vertices, faces = ball(9)
     colours = np.arange(4 * len(faces), dtype=np.uint8).reshape(-1, 4) // 64
@@ -86,7 +86,7 @@ def test_damaged_bytes_are_an_error_or_another_sound_geometry(data: st.DataObjec
 
 @pytest.mark.parametrize("n_faces", [0, 1 << 40, (1 << 64) - 1])
 @pytest.mark.parametrize("n_vertices", [1 << 20, 1 << 40, (1 << 64) - 1])
-def test_a_header_takes_no_memory_that_its_bytes_do_not_hold(n_vertices: int, n_faces: int) -> None:
+def test_unpack_geometry_header_allocates_nothing(n_vertices: int, n_faces: int) -> None:
     packed = pack(*ball(9))
     tracemalloc.start()
     try:

@@ -34,7 +34,7 @@ def assembly(
     return write_sample(tmp_path_factory.mktemp("sample"), count=2).car, SAMPLE_PARTS
 
 
-def test_every_instance_becomes_an_object_that_touches_voxels(
+def test_import_files_real_assembly_all_instances(
     assembly: tuple[Path, int], tmp_path: Path
 ) -> None:
     file, n_parts = assembly

@@ -12,7 +12,7 @@ from hapticdb.mesh import SUFFIXES, parse_in_process, read_file
 from mesh_files import cause, gltf, text, threemf
 
 
-def test_what_is_no_readable_file_is_named_with_its_cause(tmp_path: Path) -> None:
+def test_read_file_unreadable_paths(tmp_path: Path) -> None:
     assert "no such file" in cause(tmp_path / "gone.stl", read_file)
     assert "directory" in cause(tmp_path, read_file)
     assert "'.xyz'" in cause(text(tmp_path / "a.xyz", "1 2 3"), read_file)
@@ -24,9 +24,7 @@ def test_what_is_no_readable_file_is_named_with_its_cause(tmp_path: Path) -> Non
     cause(loop, read_file)
 
 
-def test_a_file_without_permission_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_read_file_permission_denied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
@@ -36,7 +34,7 @@ def test_a_file_without_permission_is_named(
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_bytes_of_another_format_end_in_one_line(tmp_path: Path, suffix: str) -> None:
+def test_parse_content_of_another_format(tmp_path: Path, suffix: str) -> None:
     strangers = {
         "stl": b"\0" * 80 + struct.pack("<I", 1) + b"\1" * 50,
         "text": b"The quick brown fox\njumps over the lazy dog\n" * 9,
@@ -54,7 +52,7 @@ def test_bytes_of_another_format_end_in_one_line(tmp_path: Path, suffix: str) ->
 
 @pytest.mark.parametrize("suffix", [".off", ".ply", ".stl", ".glb", ".3mf"])
 @pytest.mark.parametrize("kept", [0.45, 0.85])
-def test_a_file_cut_short_is_refused(
+def test_parse_truncated_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, kept: float
 ) -> None:
     monkeypatch.delenv("HAPTICDB_TEST_DATA", raising=False)
@@ -77,13 +75,11 @@ def test_a_file_cut_short_is_refused(
         ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "own ancestor"),
     ],
 )
-def test_a_glTF_that_would_be_read_wrongly_is_refused(  # noqa: N802
-    tmp_path: Path, tree: dict[str, Any], word: str
-) -> None:
+def test_gltf_unsupported_features_refused(tmp_path: Path, tree: dict[str, Any], word: str) -> None:
     assert word in cause(gltf(tree, tmp_path / "a.gltf"))
 
 
-def test_a_glb_of_version_one_and_a_3mf_that_holds_itself_are_refused(tmp_path: Path) -> None:
+def test_parse_glb_version_1_and_cyclic_threemf(tmp_path: Path) -> None:
     path = tmp_path / "a.glb"
     path.write_bytes(struct.pack("<4s2I", b"glTF", 1, 20) + b"\0\0\0\0JSON")
     assert "version 1" in cause(path)
@@ -93,7 +89,7 @@ def test_a_glb_of_version_one_and_a_3mf_that_holds_itself_are_refused(tmp_path: 
     assert "own ancestor" in cause(path)
 
 
-def test_deep_nodes_cost_no_stack(tmp_path: Path) -> None:
+def test_gltf_deep_nodes_no_recursion(tmp_path: Path) -> None:
     depth = 5000
     nodes: list[dict[str, Any]] = [{"name": "n", "children": [i + 1]} for i in range(depth)]
     nodes.append({"mesh": 0, "name": "leaf"})

@@ -78,7 +78,7 @@ EXPECTED: dict[str, Reads | str] = {
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_reported_file_reads_rightly_or_is_told(real_files: Path, name: str) -> None:
+def test_parse_reported_files(real_files: Path, name: str) -> None:
     path, expected = real_files / "reports" / name, EXPECTED[name]
     if isinstance(expected, str):
         assert expected in cause(path)
@@ -106,9 +106,7 @@ PLY_U = (
 
 @pytest.mark.parametrize("first", range(8))
 @pytest.mark.parametrize("step", [1, -1])
-def test_a_concave_polygon_is_cut_whichever_corner_is_first(
-    tmp_path: Path, first: int, step: int
-) -> None:
+def test_obj_concave_polygon_any_first_corner(tmp_path: Path, first: int, step: int) -> None:
     ring = [(first + step * n) % 8 for n in range(8)]
     lines = "".join(f"v {line}\n" for line in FLAT_U.splitlines())
     path = text(tmp_path / "u.obj", lines + "f " + " ".join(str(n + 1) for n in ring) + "\n")
@@ -118,7 +116,7 @@ def test_a_concave_polygon_is_cut_whichever_corner_is_first(
     assert np.abs(up).sum() == pytest.approx(14)
 
 
-def test_concave_polygons_beside_triangles_in_off_and_ply(tmp_path: Path) -> None:
+def test_off_ply_concave_polygons(tmp_path: Path) -> None:
     faces = "8 0 1 2 3 4 5 6 7\n3 0 1 2\n"
     corners = np.array([line.split() for line in FLAT_U.splitlines()], dtype=np.float32)
     rows = np.array([8, *range(8)], "<i4"), np.array([3, 0, 1, 2], "<i4")
@@ -131,7 +129,7 @@ def test_concave_polygons_beside_triangles_in_off_and_ply(tmp_path: Path) -> Non
         assert area_and_volume(parse_in_process(tmp_path / name))[0] == pytest.approx(7 + 4.5)
 
 
-def test_triangle_strips_of_a_ply_are_read_and_other_elements_told(tmp_path: Path) -> None:
+def test_ply_triangle_strips_and_other_elements(tmp_path: Path) -> None:
     head = PLY_U.replace(
         "element face 2", "element edge 1\nproperty int vertex1\nelement tristrips 1"
     )
@@ -142,7 +140,7 @@ def test_triangle_strips_of_a_ply_are_read_and_other_elements_told(tmp_path: Pat
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
-def test_text_is_read_in_every_unicode(tmp_path: Path, encoding: str) -> None:
+def test_parse_unicode_encodings(tmp_path: Path, encoding: str) -> None:
     contents = {
         "a.obj": "o Öse\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
         "a.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
@@ -156,7 +154,7 @@ def test_text_is_read_in_every_unicode(tmp_path: Path, encoding: str) -> None:
         assert names(file)[0] in {"a", "Öse"}
 
 
-def test_lines_that_are_passed_over_are_counted(tmp_path: Path) -> None:
+def test_obj_off_skipped_lines_counted(tmp_path: Path) -> None:
     path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nfo 1 2 3\ncall b.obj\ncall c.obj\n")
     assert (
         "2 lines begin with unknown words and are passed over: 'call' 2"
@@ -166,7 +164,7 @@ def test_lines_that_are_passed_over_are_counted(tmp_path: Path) -> None:
     assert "1 line behind the last face is passed over" in parse_in_process(path).notes
 
 
-def test_joined_files_keep_all_triangles(tmp_path: Path) -> None:
+def test_stl_concatenated_files(tmp_path: Path) -> None:
     for name, joined in {
         "unnamed": f"solid\n{FACET}endsolidsolid two\n{FACET}endsolid two\n",
         "same words": f"solid a solid\n{FACET}endsolid a solidsolid two\n{FACET}endsolid two\n",
@@ -190,7 +188,7 @@ def test_joined_files_keep_all_triangles(tmp_path: Path) -> None:
         assert "other than three corners" in cause(path)
 
 
-def test_coordinates_too_far_away_for_their_numbers_are_told(tmp_path: Path) -> None:
+def test_ply_float32_far_from_origin_note(tmp_path: Path) -> None:
     corners = np.array([line.split() for line in FLAT_U.splitlines()], dtype=np.float64) + 5e6
     face = b"\x08" + np.arange(8, dtype="<i4").tobytes()
     for kind, code, n_told in (("float", "<f4", 1), ("double", "<f8", 0)):
@@ -203,13 +201,13 @@ def test_coordinates_too_far_away_for_their_numbers_are_told(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("word", ["1,5", "-1.#IND", "1_0"])
-def test_a_word_among_numbers_is_named(tmp_path: Path, word: str) -> None:
+def test_obj_word_instead_of_number(tmp_path: Path, word: str) -> None:
     """No comment begins in the second; the third is a number to Python."""
     path = text(tmp_path / "a.obj", f"v 0 0 0\nv 1 0 0\nv 0 {word} 0\nf 1 2 3\n")
     assert f"it holds '{word}' where a number should be" in cause(path)
 
 
-def test_comments_of_an_obj_may_follow_anything_and_a_blank_line_holds_any_blank(
+def test_obj_comments_and_blanks(
     tmp_path: Path,
 ) -> None:
     corners = "v 0 0 0 # origin\nv 1 0 0.#c\nv 0 1 0 #INFO\n\xa0\no wheel #3\n"
@@ -219,7 +217,7 @@ def test_comments_of_an_obj_may_follow_anything_and_a_blank_line_holds_any_blank
     assert not file.notes
 
 
-def test_a_text_stl_on_one_line_is_read(tmp_path: Path) -> None:
+def test_stl_text_on_one_line(tmp_path: Path) -> None:
     two = f"solid a\n{FACET}endsolid a\nsolid b\n{FACET}{FACET}endsolid b"
     file = parse_in_process(text(tmp_path / "a.stl", " ".join(two.split())))
     assert names(file) == ["a", "b"]
@@ -228,7 +226,7 @@ def test_a_text_stl_on_one_line_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_lines_of_an_obj_file_are_continued_at_every_end(tmp_path: Path, end: str) -> None:
+def test_obj_line_continuation_any_line_end(tmp_path: Path, end: str) -> None:
     lines = ["v 0 0 0", "v 1 0 0", "v 0 1 0", "f 1 \\", "2 \\ ", "3", "\0\0"]
     path = tmp_path / "a.obj"
     path.write_bytes(end.join(lines).encode())
@@ -238,7 +236,7 @@ def test_lines_of_an_obj_file_are_continued_at_every_end(tmp_path: Path, end: st
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_a_ply_header_has_any_ends_of_lines_and_space_may_follow(tmp_path: Path, end: str) -> None:
+def test_ply_header_line_ends_and_space(tmp_path: Path, end: str) -> None:
     head = f"ply\nformat binary_little_endian 1.0\ncomment end_header soon\n{PLY_U}"
     head = head.replace("element face 2", "element face 1").replace("\n", end)
     corners = np.array([line.split() for line in FLAT_U.splitlines()], dtype="<f4")
@@ -250,11 +248,11 @@ def test_a_ply_header_has_any_ends_of_lines_and_space_may_follow(tmp_path: Path,
     assert "two elements of the kind 'vertex'" in cause(text(tmp_path / "b.ply", twice))
 
 
-def test_a_binary_off_file_is_refused_as_one(tmp_path: Path) -> None:
+def test_off_binary_refused(tmp_path: Path) -> None:
     assert "it is a binary OFF file" in cause(text(tmp_path / "a.off", "OFF BINARY\n\0\0\0\3"))
 
 
-def test_every_reported_file_has_its_expectation(real_files: Path) -> None:
+def test_reported_files_all_expected(real_files: Path) -> None:
     there = {path.name for path in (real_files / "reports").iterdir()}
     assert there == {*EXPECTED, "README", "q01_semicolon_decimal_comma.csv"}
 
@@ -262,9 +260,7 @@ def test_every_reported_file_has_its_expectation(real_files: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "encoding"), [("左前轮 支架", "gb18030"), ("Öse", "utf-8"), ("Größe", "latin-1")]
 )
-def test_names_of_step_and_obj_files_are_read_in_their_encoding(
-    real_files: Path, tmp_path: Path, name: str, encoding: str
-) -> None:
+def test_step_obj_name_encoding(real_files: Path, tmp_path: Path, name: str, encoding: str) -> None:
     step = (real_files / "reports" / "s04_latin1.step").read_bytes()
     step = step.replace("Träger".encode("latin-1"), name.encode(encoding))
     obj = f"o {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n".encode(encoding)

@@ -27,7 +27,7 @@ def model_3mf(path: Path, name: str, resources: str, build: str = ITEM, **beside
     return path
 
 
-def test_a_3mf_file_says_which_model_is_missing(tmp_path: Path) -> None:
+def test_threemf_missing_model_named(tmp_path: Path) -> None:
     path = model_3mf(tmp_path / "a.3mf", "3D/other.model", THING)
     assert "its root model 3d/3dmodel.model is missing; 3D/other.model is in it" in cause(path)
     path = model_3mf(tmp_path / "b.3mf", "read.me", THING)
@@ -36,7 +36,7 @@ def test_a_3mf_file_says_which_model_is_missing(tmp_path: Path) -> None:
     assert len(parse_in_process(path).parts) == 1
 
 
-def test_what_a_3mf_file_does_not_build_is_counted(tmp_path: Path) -> None:
+def test_threemf_objects_not_in_build_counted(tmp_path: Path) -> None:
     two = "".join(f'<object id="{n}">{MESH_3MF}</object>' for n in (1, 2))
     file = parse_in_process(threemf(tmp_path / "a.3mf", two, ITEM))
     assert file.notes == ("1 object is not in its build and is left out",)
@@ -47,15 +47,13 @@ def test_what_a_3mf_file_does_not_build_is_counted(tmp_path: Path) -> None:
     ("settings", "kind"),
     [("Slic3r_PE_model", "NegativeVolume"), ("model_settings", "modifier_part")],
 )
-def test_volumes_that_a_slicer_subtracts_or_changes_are_told(
-    tmp_path: Path, settings: str, kind: str
-) -> None:
+def test_threemf_slicer_volumes_note(tmp_path: Path, settings: str, kind: str) -> None:
     beside = {f"Metadata__{settings}_DOT_config": f'<a key="support_type"/><b subtype="{kind}"/>'}
     file = parse_in_process(model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", THING, **beside))
     assert file.notes == (f"1 object is of the type {kind}, and comes in like any other",)
 
 
-def test_the_root_of_a_3mf_is_the_one_that_its_relationships_name(tmp_path: Path) -> None:
+def test_threemf_root_of_relationships(tmp_path: Path) -> None:
     path = threemf(tmp_path / "a.3mf", f'<object id="1" name="new">{MESH_3MF}</object>', ITEM)
     old = threemf(tmp_path / "b.3mf", f'<object id="1" name="old">{MESH_3MF}</object>', ITEM)
     with zipfile.ZipFile(old) as archive:
@@ -80,7 +78,7 @@ def test_the_root_of_a_3mf_is_the_one_that_its_relationships_name(tmp_path: Path
         assert names(parse_in_process(named)) == ["old"]
 
 
-def test_damage_beside_the_models_of_a_3mf_file_loses_nothing(tmp_path: Path) -> None:
+def test_threemf_damage_beside_models(tmp_path: Path) -> None:
     beside = {"Metadata__model_settings_DOT_config": "settings of a slicer"}
     path = model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", THING, **beside)
     path.write_bytes(path.read_bytes().replace(b"settings of a slicer", b"Settings of a slicer"))

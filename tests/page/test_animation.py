@@ -30,7 +30,7 @@ def of_node(messages: list[tuple[float, dict[str, Any]]], name: str, kind: str) 
     return [(t, one) for t, one in messages if one["type"] == kind and one.get("name") == name]
 
 
-def test_the_page_plays_all_steps_in_their_order(tmp_path: Path) -> None:
+def test_animate_steps_in_order(tmp_path: Path) -> None:
     with hapticdb.open(made(tmp_path, STACK), read_only=True) as env:
         found = hapticdb.disassemble(env, "lid", keep=["pot"], motions=0)
         steps = [step.found for step in found.steps]

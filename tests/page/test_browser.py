@@ -12,7 +12,7 @@ from hapticdb.page.connection import Visitor
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_browser_that_leaves_or_fails_while_its_panels_are_made_leaves_nothing(
+def test_browser_closed_or_failed_during_setup(
     fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site, client = MagicMock(browsers={}), SimpleNamespace(client_id=7)
@@ -43,7 +43,7 @@ def test_a_browser_that_leaves_or_fails_while_its_panels_are_made_leaves_nothing
     [([3], {3}, 0), ([3], {3, 7}, 1), ([3, 5], {3}, 0), ([], {7}, 1)],
     ids=["as before", "an unseen one comes", "an unseen one goes", "the first unseen one"],
 )
-def test_what_is_not_seen_is_not_felt_when_it_comes(
+def test_browser_objects_changed_restarts_session(
     felt_without: list[int], hidden: set[int], n_begun: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     browser = Browser.__new__(Browser)

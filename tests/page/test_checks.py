@@ -13,13 +13,13 @@ from hapticdb.poses import pose_of_row
 @pytest.mark.parametrize(
     "value", [-0.1, 10.1, math.nan, math.inf, -math.inf, True, "5", None, [5.0], {"a": 1}]
 )
-def test_any_other_number_is_refused_with_its_range(value: object) -> None:
+def test_number_of_bad_values(value: object) -> None:
     assert checks.number_of(np.float64(10.0), 0.0, 10.0, "a length") == 10.0
     with pytest.raises(UsageError, match="a length"):
         checks.number_of(value, 0.0, 10.0, "a length")
 
 
-def test_a_choice_is_in_the_list_and_a_text_is_one_line_and_a_box_is_ticked_or_not() -> None:
+def test_choice_of_text_of_flag_of_bad_values() -> None:
     assert checks.choice_of("a", ("a", "b"), "a tool") == "a"
     assert checks.text_of("wheel\x00\n\x1b left", 20, "a search") == "wheel left"
     assert checks.flag_of(True, "voxels")
@@ -32,7 +32,7 @@ def test_a_choice_is_in_the_list_and_a_text_is_one_line_and_a_box_is_ticked_or_n
             checks.flag_of(value, "voxels")
 
 
-def test_a_pose_is_a_rotation_whatever_the_quaternions_length() -> None:
+def test_row_of_normalises_quaternion() -> None:
     row = checks.row_of((1.0, 2.0, 3.0), (2.0, 0.0, 0.0, 2.0))
     pose = pose_of_row(row[:3], row[3:])
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -52,6 +52,6 @@ def test_a_pose_is_a_rotation_whatever_the_quaternions_length() -> None:
         (None, None),
     ],
 )
-def test_no_other_pose_moves_a_hand(place: object, turn: object) -> None:
+def test_row_of_bad_pose(place: object, turn: object) -> None:
     with pytest.raises(UsageError):
         checks.row_of(place, turn)

@@ -72,7 +72,7 @@ def said(ours: socket.socket) -> bytes:
     return received
 
 
-def test_a_connection_with_the_secret_is_let_in_under_its_name(page: Page) -> None:
+def test_connection_with_secret(page: Page) -> None:
     with entered(page, "toucher") as browser:
         assert browser.recv(timeout=TIMEOUT)
         assert page.link.visitor(0) == Visitor("Guest 1", "toucher")
@@ -91,9 +91,7 @@ def test_a_connection_with_the_secret_is_let_in_under_its_name(page: Page) -> No
         [(SECRET, "the secret"), (SECRET, "the secret")],
     ],
 )
-def test_whoever_lacks_the_secret_is_sent_away_with_nothing(
-    page: Page, shown: dict[str, str]
-) -> None:
+def test_connection_without_secret_refused(page: Page, shown: dict[str, str]) -> None:
     page.server.scene.add_label("/secret", "secret")
     named = Headers(shown)
     named.update({NAME: "Guest 1", ROLE: "editor"})
@@ -106,7 +104,7 @@ def test_whoever_lacks_the_secret_is_sent_away_with_nothing(
     assert page.server.get_clients() == {}
 
 
-def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(
+def test_connection_viser_errors_one_line(
     page: Page, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Asyncio would write a traceback for each of them."""

@@ -63,14 +63,14 @@ def shown(path: Path) -> Shown:
     return Shown(path)
 
 
-def test_boxes_come_first_and_then_every_triangle_once(shown: Shown) -> None:
+def test_contents_boxes_then_each_triangle_once(shown: Shown) -> None:
     """Equal parts are one node; a mirrored one is drawn, too."""
     assert shown.n_boxes == 12 * len(shown.objects)
     assert len(shown.scene.nodes) < 10
     assert are_same(drawn(shown.scene), shown.of(set(shown.triangles)))
 
 
-def test_parts_at_survey_coordinates_are_drawn_in_place(tmp_path: Path) -> None:
+def test_contents_survey_coordinates(tmp_path: Path) -> None:
     """A browser has vertices and places in float32, which knows half metres there."""
     where = np.array([515_369.0, 4_918_340.0, 2_322.0])
     shown = Shown(write_parts(tmp_path, where=where.tolist()))
@@ -78,9 +78,7 @@ def test_parts_at_survey_coordinates_are_drawn_in_place(tmp_path: Path) -> None:
     assert are_same(drawn(shown.scene) - where, wanted)
 
 
-def test_parts_have_the_file_s_colours_and_glass_is_seen_through(
-    tmp_path: Path, path: Path
-) -> None:
+def test_contents_colours_and_transparency(tmp_path: Path, path: Path) -> None:
     nodes = [vars(node) for node in Shown(path).scene.nodes.values()]
     red = np.array([200, 40, 40])  # light, as in the file
     assert sum(bool((np.abs(node["batched_colors"] - red) < 2).all()) for node in nodes) == 1
@@ -95,7 +93,7 @@ def test_parts_have_the_file_s_colours_and_glass_is_seen_through(
     assert found == [(4, pytest.approx(64 / 255)), (8, None)]
 
 
-def test_a_cloud_is_points_by_height_or_in_its_own_colours(tmp_path: Path) -> None:
+def test_contents_cloud_colours_hidden_and_marked(tmp_path: Path) -> None:
     """Hidden it is gone, marked it has the colour of what is marked."""
     points = np.random.default_rng(1).uniform(0.0, 1.0, (500, 3))
     for colours in (None, np.tile(np.array([[9, 99, 199, 255]], dtype=np.uint8), (500, 1))):
@@ -127,7 +125,7 @@ shown_once = cache(Shown)
     st.sampled_from([MARKED, FADED]),
     st.integers(0, 2),
 )
-def test_one_browser_hides_marks_and_fades_for_itself(
+def test_contents_appearance_per_browser(
     path: Path, hidden: set[int], marked: set[int], shade: Colour | Rgba, rounds: int
 ) -> None:
     shown, own = shown_once(path), RecordedScene()
@@ -170,7 +168,7 @@ def moved(triangles: NDArray[np.float64], obj: Object, to: NDArray[np.float64]) 
     return triangles @ way[:3, :3].T + way[:3, 3]
 
 
-def test_moves_are_drawn_in_place_and_send_few_bytes(shown: Shown) -> None:
+def test_contents_moves_drawn_with_few_bytes(shown: Shown) -> None:
     """A commit takes the place of a preview."""
     contents, expected = shown.contents, dict(shown.triangles)
     for obj in (shown.objects[0], shown.objects[3], shown.objects[-1], shown.objects[-2]):
@@ -192,7 +190,7 @@ def test_moves_are_drawn_in_place_and_send_few_bytes(shown: Shown) -> None:
     assert are_same(drawn(shown.scene), np.concatenate(list(expected.values())))
 
 
-def test_removed_objects_are_not_drawn(shown: Shown) -> None:
+def test_contents_removed_objects_not_drawn(shown: Shown) -> None:
     gone = {shown.objects[0].id, shown.objects[3].id, shown.objects[-2].id}
     shown.contents.remove([*gone, 10_000])
     shown.contents.refresh()

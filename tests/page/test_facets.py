@@ -14,7 +14,7 @@ def facets_of(mesh: trimesh.Trimesh) -> Facets:
 
 
 @given(st.integers(0, 2**32), st.integers(1, 40))
-def test_splitting_keeps_every_triangle_in_its_place(seed: int, n_faces: int) -> None:
+def test_sharpened_triangles_unchanged(seed: int, n_faces: int) -> None:
     rng = np.random.default_rng(seed)
     vertices = rng.integers(-2, 3, (12, 3)) / 2.0  # many equal positions
     before = Facets(vertices, rng.integers(0, 12, (n_faces, 3)))
@@ -23,13 +23,13 @@ def test_splitting_keeps_every_triangle_in_its_place(seed: int, n_faces: int) ->
     assert len(after.vertices) <= 3 * n_faces
 
 
-def test_a_cylinder_is_sharp_at_its_rims_alone() -> None:
+def test_sharpened_cylinder_rims_only() -> None:
     rod = facets_of(trimesh.creation.cylinder(1.0, 2.0, sections=64))
     assert len(sharpened([rod])[0].vertices) == 4 * 64 + 2  # each rim twice, and two centres
 
 
 @given(st.integers(0, 2**32), st.integers(1, 60))
-def test_blocks_have_the_volume_of_their_voxels_and_no_inner_sides(seed: int, n: int) -> None:
+def test_block_facets_volume_and_outer_sides(seed: int, n: int) -> None:
     voxels = np.unique(np.random.default_rng(seed).integers(0, 5, (n, 3)), axis=0)
     shown = block_facets(Blocks(voxels, 1))
     sides = sum(
@@ -45,7 +45,7 @@ def test_blocks_have_the_volume_of_their_voxels_and_no_inner_sides(seed: int, n:
 
 
 @given(st.integers(0, 2**32), st.integers(1, 50))
-def test_larger_cubes_hold_all_voxels(seed: int, most: int) -> None:
+def test_coarsened_cubes_enclose_voxels(seed: int, most: int) -> None:
     voxels = np.unique(np.random.default_rng(seed).integers(0, 200, (300, 3)), axis=0)
     blocks = coarsened(voxels, most)
     held = {tuple(place) for place in blocks.places.tolist()}

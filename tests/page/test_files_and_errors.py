@@ -35,7 +35,7 @@ def scene(made: Path, tmp_path: Path) -> Path:
     return shutil.copytree(made.parent, tmp_path / "of the operator") / made.name
 
 
-def test_survey_coordinates_of_the_hand_are_read_and_typed_whole(tmp_path: Path) -> None:
+def test_browser_typed_survey_coordinates(tmp_path: Path) -> None:
     low = np.array([515369.25, 4918340.10, 102.0])
     box = trimesh.creation.box(bounds=[low, low + 40.0])
     box.export(tmp_path / "box.obj", digits=2)
@@ -69,7 +69,7 @@ def told(person: PagePerson, *, after: int) -> str:
     return person.told[after]
 
 
-def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) -> None:
+def test_browser_errors_name_no_path(scene: Path) -> None:
     folder = scene.parent
     recordings = folder / "recorded here"
     recordings.mkdir()
@@ -109,7 +109,7 @@ def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) ->
 
 
 @pytest.mark.parametrize("is_direct", [False, True])
-def test_a_hand_without_a_spring_has_no_stiffness(scene: Path, *, is_direct: bool) -> None:
+def test_browser_stiffness_only_with_coupling(scene: Path, *, is_direct: bool) -> None:
     with page_of(scene, is_direct=is_direct) as (site, person, browser):
         labels = [widget.get("label") for widget in person.widgets.values()]
         assert ("Stiffness, N/m" in labels) == site.is_coupled == (not is_direct)
@@ -137,20 +137,20 @@ URL = "postgresql://ada:s3cret@db.example:5432/cars?environment=beetle&password=
         ("body/door/handle is back, 3 N/m, 1 / 2", "body/door/handle is back, 3 N/m, 1 / 2"),
     ],
 )  # fmt: skip
-def test_addresses_and_folders_are_taken_out_of_errors(said: str, expected: str) -> None:
+def test_error_text_without_addresses_and_folders(said: str, expected: str) -> None:
     addresses = ("/srv/car.db", "data/car.db", URL)
     found = error_text(FileError(said), addresses, ("known:folder, of parts/", "", "/"))
     assert found == expected
     assert error_text(HapticDBError(found), addresses) == found
 
 
-def test_what_nobody_has_foreseen_is_told_without_its_words() -> None:
+def test_error_text_unexpected_error_hidden() -> None:
     assert error_text(RuntimeError("/srv/a: s3cret"), ()) == FAULT
     assert error_text(DatabaseError("busy"), ()) == "busy"
 
 
 @pytest.mark.long
-def test_the_part_in_hand_is_the_only_one_that_is_unseen(scene: Path) -> None:
+def test_browser_dragged_part_alone_hidden(scene: Path) -> None:
     with page_of(scene) as (_, person, browser):
         for name in ("box.stl", "ball.stl"):
             part = choose(browser, name)
@@ -166,7 +166,7 @@ def test_the_part_in_hand_is_the_only_one_that_is_unseen(scene: Path) -> None:
 
 
 @pytest.mark.parametrize(("hits", "told"), [(True, "hits ball at 50 %"), (False, "clear by 3 mm")])
-def test_a_sweep_is_told_and_shown(
+def test_browser_sweep_verdict_shown(
     scene: Path, monkeypatch: pytest.MonkeyPatch, hits: bool, told: str
 ) -> None:
     with page_of(scene) as (site, person, browser):

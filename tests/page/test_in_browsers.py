@@ -140,7 +140,7 @@ def type_place(page: Page, place: Floats) -> None:
         entry.fill(f"{value:.5f}")
 
 
-def test_one_feels_a_part_until_another_takes_it_out(
+def test_page_chromium_two_people_one_removes_part(
     server: Running, aim: Aim, tmp_path: Path
 ) -> None:
     token = next(token for token, role in TOKENS.items() if role is Role.EDITOR)

@@ -18,7 +18,7 @@ SLIDE = """
 """
 
 
-def test_machine_panel_sweeps_the_path_where_the_base_stands(tmp_path: Path) -> None:
+def test_machine_panel_sweep_at_base_pose(tmp_path: Path) -> None:
     (tmp_path / "slide.urdf").write_text(SLIDE)
     (tmp_path / "path.csv").write_text("x [mm]\n-500\n500\n")
     files = MachineFiles(str(tmp_path / "slide.urdf"), None, str(tmp_path / "path.csv"), np.eye(4))

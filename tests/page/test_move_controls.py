@@ -107,7 +107,7 @@ def up(height: float) -> NDArray[np.float64]:
     return way
 
 
-def test_a_move_is_written_when_it_is_let_go_of(table: Table) -> None:
+def test_move_controls_write_on_release(table: Table) -> None:
     before = table.placement
     table.drag(0.002, "start", "update")
     assert table.asked == []
@@ -120,7 +120,7 @@ def test_a_move_is_written_when_it_is_let_go_of(table: Table) -> None:
     assert table.told == ["Done"]
 
 
-def test_a_connection_that_is_lost_in_a_drag_moves_nothing(table: Table) -> None:
+def test_move_controls_lost_connection_writes_nothing(table: Table) -> None:
     table.drag(0.002, "start", "update")
     table.clients.clear()
     table.drag(0.0, "end")  # as viser ends it
@@ -129,7 +129,7 @@ def test_a_connection_that_is_lost_in_a_drag_moves_nothing(table: Table) -> None
 
 
 @pytest.mark.parametrize("order", ["work see drag", "drag work drag"])
-def test_a_drag_that_follows_another_goes_on_from_it(table: Table, order: str) -> None:
+def test_move_controls_consecutive_drags(table: Table, order: str) -> None:
     """Also before the first is written, and before this browser has read what is written."""
     before, n_drags = table.placement, 0
     table.drag(0.002)
@@ -149,7 +149,7 @@ def test_a_drag_that_follows_another_goes_on_from_it(table: Table, order: str) -
     assert set(table.told) == {"Done"}
 
 
-def test_another_persons_move_refuses_the_drag_and_stays(table: Table) -> None:
+def test_move_controls_concurrent_move_conflict(table: Table) -> None:
     table.drag(0.002, "start", "update")
     theirs = table.env.move(table.id, up(-0.003) @ table.placement)
     table.see()
@@ -165,7 +165,7 @@ def test_another_persons_move_refuses_the_drag_and_stays(table: Table) -> None:
     assert np.allclose(table.placement, up(0.001) @ theirs.transform)
 
 
-def test_a_drag_of_a_gizmo_that_was_replaced_is_dropped(table: Table) -> None:
+def test_move_controls_drag_of_replaced_gizmo_dropped(table: Table) -> None:
     table.drag(0.002, "start", "update")
     table.controls.follow()
     assert table.previews[-1] is None
@@ -178,7 +178,7 @@ def test_a_drag_of_a_gizmo_that_was_replaced_is_dropped(table: Table) -> None:
     assert len(table.gizmos) == 3
 
 
-def test_two_threads_never_change_the_gizmo_at_once(table: Table) -> None:
+def test_move_controls_gizmo_thread_exclusion(table: Table) -> None:
     others: list[threading.Thread] = []
     n_inside, most = 0, 0
 

@@ -44,7 +44,7 @@ def nearest(
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32), st.sampled_from([1e-3, 1.0, 1e3]))
-def test_the_first_object_is_that_of_a_search_over_all_triangles(seed: int, size: float) -> None:
+def test_targets_first_equals_brute_force(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     members: dict[int, Member] = {}
     targets, triangles = Targets(members), {}
@@ -73,7 +73,7 @@ def test_the_first_object_is_that_of_a_search_over_all_triangles(seed: int, size
             assert np.allclose(found.point, start + found.distance * way)
 
 
-def test_a_box_is_met_until_its_shape_is_there() -> None:
+def test_targets_first_box_before_shape() -> None:
     box = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     members = {3: Member(3, np.eye(4), box, (0, 0, 0))}
     targets = Targets(members)
@@ -86,7 +86,7 @@ def test_a_box_is_met_until_its_shape_is_there() -> None:
     assert targets.first([0.2, 0.1, 5.0], [0, 0, -2.0], lambda _: True) is None
 
 
-def test_thousands_of_shapes_can_be_hit() -> None:
+def test_targets_first_thousands_of_shapes() -> None:
     members: dict[int, Member] = {}
     targets = Targets(members)
     for number in range(1500):  # Embree crashes when each has a device of its own

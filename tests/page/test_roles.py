@@ -32,7 +32,7 @@ def browser_of(role: str) -> tuple[Browser, list[tuple[str, str]]]:
 
 @pytest.mark.parametrize("has", ROLES)
 @pytest.mark.parametrize("needs", ROLES)
-def test_a_callback_runs_only_for_those_who_may(has: str, needs: str) -> None:
+def test_guarded_callback_by_role(has: str, needs: str) -> None:
     browser, told = browser_of(has)
     done: list[object] = []
     browser.guarded(needs, done.append)("event")
@@ -43,7 +43,7 @@ def test_a_callback_runs_only_for_those_who_may(has: str, needs: str) -> None:
         assert needs in told[0][1]
 
 
-def test_an_error_is_told_to_the_person_and_a_fault_names_nothing() -> None:
+def test_guarded_error_message_names_nothing() -> None:
     browser, told = browser_of("editor")
 
     def refuse(_: object) -> None:
@@ -59,7 +59,7 @@ def test_an_error_is_told_to_the_person_and_a_fault_names_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../a.hdbrec", "/a.hdbrec", "a/b.hdbrec", ".a"])
-def test_a_recordings_name_never_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
+def test_checked_file_inside_folder(tmp_path: Path, name: str) -> None:
     assert checked_file(tmp_path, "a.hdbrec") == tmp_path / "a.hdbrec"
     with pytest.raises(UsageError):
         checked_file(tmp_path, name)
@@ -67,7 +67,7 @@ def test_a_recordings_name_never_leads_out_of_its_folder(tmp_path: Path, name: s
         checked_file(None, "a.hdbrec")
 
 
-def test_a_browser_that_has_gone_is_asked_and_told_nothing(
+def test_guarded_closed_browser_silent(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     browser, told = browser_of("viewer")

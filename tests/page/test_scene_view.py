@@ -41,9 +41,7 @@ def from_above(view: SceneView, obj: Object) -> RayHit | None:
     return view.contents.pick(middle + np.array([0, 0, 3]), [0, 0, -1], lambda _: True)
 
 
-def test_moves_removals_and_additions_of_others_are_followed(
-    server: viser.ViserServer, place: Path
-) -> None:
+def test_scene_view_follows_commits(server: viser.ViserServer, place: Path) -> None:
     with closing(SceneView(server, str(place))) as view, hapticdb.open(place) as other:
         all_shown(view)
         assert len(view.objects) == 16
@@ -68,7 +66,7 @@ def test_moves_removals_and_additions_of_others_are_followed(
 
 
 @pytest.mark.parametrize("has_surfaces", [True, False])
-def test_no_file_is_needed_and_voxels_stand_for_objects_without_a_surface(
+def test_scene_view_voxels_without_surface(
     server: viser.ViserServer, place: Path, has_surfaces: bool
 ) -> None:
     place.with_suffix(".glb").unlink()
@@ -83,8 +81,6 @@ def test_no_file_is_needed_and_voxels_stand_for_objects_without_a_surface(
         assert abs(above) < 1e-4 if has_surfaces else -1e-9 <= above <= 0.03
 
 
-def test_an_environment_that_is_not_there_is_an_error(
-    server: viser.ViserServer, tmp_path: Path
-) -> None:
+def test_scene_view_missing_environment(server: viser.ViserServer, tmp_path: Path) -> None:
     with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
         SceneView(server, str(tmp_path / "none.db"))

@@ -28,7 +28,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return two_parts(tmp_path_factory.mktemp("seen"))
 
 
-def test_a_job_says_what_is_done_and_then_its_result_stays() -> None:
+def test_panel_job_progress_then_result() -> None:
     said: list[str] = []
     with ThreadPoolExecutor(1) as threads:
         site = SimpleNamespace(sweeping=threads)
@@ -61,7 +61,9 @@ def test_a_job_says_what_is_done_and_then_its_result_stays() -> None:
     assert not any(WAITS in text for text in said)
 
 
-def test_the_shadow_is_that_of_what_is_shown(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_browser_scene_shadow_of_visible_objects(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     drawn: list[Any] = []
     monkeypatch.setattr(
         "hapticdb.page.scene.browser_scene.add_shadow", lambda _, boxes, *__: drawn.append(boxes)
@@ -77,7 +79,7 @@ def test_the_shadow_is_that_of_what_is_shown(scene: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("search", ["", "pump"])
-def test_a_tree_of_thousands_has_few_widgets_and_chooses_many_at_once(search: str) -> None:
+def test_parts_tree_thousands_of_objects(search: str) -> None:
     names = {i: f"plant {i % 40}/unit {i % 300}/{'pump' * (i % 7 > 0)} {i}" for i in range(4211)}
     objects = {i: SimpleNamespace(name=name) for i, name in names.items()}
     groups: list[Any] = []
@@ -111,7 +113,7 @@ def test_a_tree_of_thousands_has_few_widgets_and_chooses_many_at_once(search: st
     assert gui.add_folder.call_count == n_folders
 
 
-def test_a_section_is_at_a_share_of_the_depth_and_in_the_link() -> None:
+def test_view_controls_section_plane_and_link() -> None:
     camera = MagicMock(position=np.array([0.0, -3.0, 0.0]), look_at=np.zeros(3), near=0.01)
     bounds = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
     site = MagicMock(view=SimpleNamespace(up=2), facts=SimpleNamespace(bounds=bounds))
@@ -136,7 +138,7 @@ def test_a_section_is_at_a_share_of_the_depth_and_in_the_link() -> None:
     assert camera.near == pytest.approx(8.5)
 
 
-def test_the_distance_of_two_chosen_parts_is_exact(scene: Path) -> None:
+def test_parts_distance_of_two_selected(scene: Path) -> None:
     with page_of(scene) as (site, person, browser):
         browser.parts.choose([*site.objects])
         with hapticdb.open(scene, read_only=True) as env:

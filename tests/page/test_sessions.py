@@ -103,9 +103,7 @@ def person(host: FakeHost) -> Iterator[Person]:
         host.may_begin.set()
 
 
-def test_a_lost_session_is_ended_in_the_host_and_the_panel_knows(
-    host: FakeHost, person: Person
-) -> None:
+def test_browser_lost_session_restarts(host: FakeHost, person: Person) -> None:
     host.begun[0].is_over = True
     for n in range(3):
         person.tick(float(n))
@@ -116,9 +114,7 @@ def test_a_lost_session_is_ended_in_the_host_and_the_panel_knows(
     assert person.told == ["Tool lost: its process ended; it begins again"]
 
 
-def test_a_tool_that_is_taken_six_times_at_once_is_drawn_once_at_a_time(
-    host: FakeHost, person: Person
-) -> None:
+def test_begin_anew_concurrent_clicks_serialised(host: FakeHost, person: Person) -> None:
     """As by the button "Back to the start": viser calls each click in a thread of its own."""
     n_inside, together, pressed = 0, [], threading.Barrier(6)
 
@@ -141,7 +137,7 @@ def test_a_tool_that_is_taken_six_times_at_once_is_drawn_once_at_a_time(
     assert sum(not session.is_over for session in host.begun) == 1
 
 
-def test_a_lost_session_of_a_browser_that_goes_is_ended(host: FakeHost, person: Person) -> None:
+def test_browser_lost_session_ended_on_close(host: FakeHost, person: Person) -> None:
     host.may_begin.clear()
     host.begun[0].is_over = True
     person.tick(0.0)
@@ -154,9 +150,7 @@ def test_a_lost_session_of_a_browser_that_goes_is_ended(host: FakeHost, person: 
     assert person.said[-2:] == ["unshare", "rest"]
 
 
-def test_a_begin_that_fails_takes_force_and_tool_out_of_view(
-    host: FakeHost, person: Person
-) -> None:
+def test_begin_anew_failure_hides_force_and_tool(host: FakeHost, person: Person) -> None:
     host.is_failing = True
     person.begin_anew()
     until(lambda: person.told)
@@ -166,9 +160,7 @@ def test_a_begin_that_fails_takes_force_and_tool_out_of_view(
     assert host.begun[0].n_ends == 1
 
 
-def test_many_quick_wishes_take_one_worker_and_the_newest_is_done(
-    host: FakeHost, person: Person
-) -> None:
+def test_begin_anew_many_requests_newest_wins(host: FakeHost, person: Person) -> None:
     host.may_begin.clear()
     person.begin_anew()
     until(lambda: host.n_asked == 2)
@@ -185,7 +177,7 @@ def test_many_quick_wishes_take_one_worker_and_the_newest_is_done(
     assert person.session is host.begun[-1]  # type: ignore[comparison-overlap]
 
 
-def test_a_recording_that_lost_frames_tells_so_at_its_end(host: FakeHost, person: Person) -> None:
+def test_browser_recording_lost_frames_reported(host: FakeHost, person: Person) -> None:
     host.begun[0].lost_frames = 1200  # its person pressed Stop
     person.tick(0.0)
     person.tick(0.1)

@@ -17,7 +17,7 @@ VOXEL = 0.002
 
 
 @pytest.mark.parametrize("has_distances", [True, False])
-def test_probes_are_closed_and_about_their_origin(has_distances: bool) -> None:
+def test_built_in_probes_closed_and_centred(has_distances: bool) -> None:
     small = tools.built_in(1e-3, VOXEL, has_distances=has_distances)[0]
     assert small.radius == pytest.approx(tools.LEAST_VOXELS * VOXEL, rel=0.01)
     probes = tools.built_in(1.0, VOXEL, has_distances=has_distances)
@@ -32,7 +32,7 @@ def test_probes_are_closed_and_about_their_origin(has_distances: bool) -> None:
         assert deepest == pytest.approx(ONSET * VOXEL if has_distances else 0.0, rel=0.05)
 
 
-def test_a_shell_far_from_its_origin_is_centred_with_its_normals_kept() -> None:
+def test_from_shell_centred_with_normals() -> None:
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) + 40.0
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     shell = PointShell.from_mesh(corners, faces, 50)
@@ -43,7 +43,7 @@ def test_a_shell_far_from_its_origin_is_centred_with_its_normals_kept() -> None:
     assert held.radius == pytest.approx(np.sqrt(0.75))
 
 
-def test_a_saved_shell_is_drawn_as_its_hull() -> None:
+def test_from_shell_convex_hull() -> None:
     ball = PointShell.sphere(0.5, 200)
     saved = PointShell(ball.points + 3.0, ball.normals, ball.center + 3.0)
     held = tools.from_shell("ball", saved)
@@ -56,7 +56,7 @@ def test_a_saved_shell_is_drawn_as_its_hull() -> None:
 
 
 @pytest.mark.parametrize("up", [0, 1, 2])
-def test_tools_start_free_and_apart(up: int) -> None:
+def test_start_pose_free_and_apart(up: int) -> None:
     bounds = np.array([[-1.0, -0.5, -0.2], [1.0, 0.5, 0.4]])
     axes = np.eye(3)
     radius = 0.1
@@ -75,7 +75,7 @@ def test_tools_start_free_and_apart(up: int) -> None:
 
 
 @pytest.mark.parametrize("radius", [1e-4, 0.1, 1.0, 100.0])
-def test_the_first_view_shows_scene_and_tool_however_large_it_is(radius: float) -> None:
+def test_first_view_contains_scene_and_tool(radius: float) -> None:
     bounds = np.array([[-1.0, -0.5, -0.2], [1.0, 0.5, 0.4]])
     facts = SceneFacts(bounds, np.eye(3)[2], np.eye(3)[1], VOXEL, has_distances=True)
     server = SimpleNamespace(initial_camera=SimpleNamespace())
@@ -92,7 +92,7 @@ def test_the_first_view_shows_scene_and_tool_however_large_it_is(radius: float) 
         assert camera.near < away - size < away + size < camera.far
 
 
-def test_contacts_have_the_colour_of_the_nearest_touched_object() -> None:
+def test_of_contacts_colour_of_nearest_object() -> None:
     def box(number: int, low: float) -> Object:
         bounds = np.array([[low] * 3, [low + 1.0] * 3])
         return Object("part", "", "", np.eye(4), 1, bounds, id=number)

@@ -85,7 +85,7 @@ def state_of(env: Environment) -> State:
 
 
 @pytest.mark.parametrize("url", ENGINES, indirect=True, ids=named)
-def test_every_step_is_one_write_and_is_undone_exactly(one: PersonsEdits, env: Environment) -> None:
+def test_undo_each_step_one_write_exact(one: PersonsEdits, env: Environment) -> None:
     states, revisions = [state_of(env)], [env.store.revision()]
     steps: list[Callable[[], object]] = [
         lambda: one.move(env.object(1), up(0.2)),
@@ -111,7 +111,7 @@ def test_every_step_is_one_write_and_is_undone_exactly(one: PersonsEdits, env: E
     assert said[2:4] == ["undid: took out 2 (cube1)", "undid: moved 1 (cube0) by 100 mm"]
 
 
-def test_the_second_of_two_is_told_and_nothing_is_lost(
+def test_edits_conflict_of_two_people(
     one: PersonsEdits, other: PersonsEdits, env: Environment
 ) -> None:
     seen = env.object(1)
@@ -128,7 +128,7 @@ def test_the_second_of_two_is_told_and_nothing_is_lost(
 
 
 @pytest.mark.parametrize("follows", [False, True])
-def test_undo_goes_not_behind_what_another_has_written(
+def test_undo_not_before_edit_of_another(
     one: PersonsEdits, other: PersonsEdits, env: Environment, *, follows: bool
 ) -> None:
     """Steps of other objects can be undone after that; those of this object before it cannot."""
@@ -147,7 +147,7 @@ def test_undo_goes_not_behind_what_another_has_written(
     assert np.array_equal(env.object(1).transform, theirs.transform)
 
 
-def test_what_another_has_taken_out_is_told(
+def test_edits_object_removed_by_another(
     one: PersonsEdits, other: PersonsEdits, env: Environment
 ) -> None:
     seen = one.move(env.object(1), up(0.1))
@@ -162,7 +162,7 @@ def test_what_another_has_taken_out_is_told(
     assert np.array_equal(env.object(1).transform, moved.transform)
 
 
-def test_what_another_has_imported_again_is_not_put_back(
+def test_undo_removed_part_imported_again(
     one: PersonsEdits, url: str, env: Environment, file: Path
 ) -> None:
     one.take_out(env.object(3))
@@ -187,9 +187,7 @@ STEPS = st.lists(
     max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(steps=STEPS)
-def test_a_refused_step_writes_nothing_and_any_other_writes_once(
-    env: Environment, steps: list[tuple[int, str]]
-) -> None:
+def test_edits_random_steps_of_two_people(env: Environment, steps: list[tuple[int, str]]) -> None:
     """Two people at once, on one object, in any order."""
     people = PersonsEdits(env), PersonsEdits(env)
     seen: list[Object] = [env.object(1)] * 2
@@ -216,7 +214,7 @@ def test_a_refused_step_writes_nothing_and_any_other_writes_once(
     assert {obj.id for obj in env.objects()} == {1, 2, 3}
 
 
-def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
+def test_edits_asynchronous_one_connection(
     url: str, env: Environment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And each person has steps of their own."""

@@ -11,7 +11,7 @@ HOSTILE = '<img src=x onerror="alert(1)">&amp;</td><script>'
 @pytest.mark.parametrize(
     "html", [escaped(HOSTILE), note_html(HOSTILE), rows_html([(HOSTILE,) * 2])]
 )
-def test_no_name_becomes_a_tag(html: str) -> None:
+def test_escaped_html_of_hostile_names(html: str) -> None:
     assert "<img" not in html
     assert "<script" not in html
     assert "&lt;img" in html
@@ -19,7 +19,7 @@ def test_no_name_becomes_a_tag(html: str) -> None:
     assert html.count("</td>") == html.count("<td")
 
 
-def test_a_short_name_has_at_most_its_letters_and_keeps_both_ends() -> None:
+def test_short_name_both_ends() -> None:
     name = "assembly/sub/" + "a very long name of a part, number " * 3 + "17"
     short = short_name(name, 34)
     assert len(short) == 34
@@ -29,7 +29,7 @@ def test_a_short_name_has_at_most_its_letters_and_keeps_both_ends() -> None:
     assert short_name("left/door", 6) == "door"
 
 
-def test_names_stay_on_one_line() -> None:
+def test_plain_name_one_line() -> None:
     assert plain_name("a\nb\x1b[31m\u202e") == "a?b?[31m?"
     assert plain_name("") == "(no name)"
 
@@ -43,12 +43,12 @@ NAMES = {
 }
 
 
-def test_each_sub_assembly_has_the_objects_below_it_and_stands_before_what_it_holds() -> None:
+def test_assemblies_of_descendants_in_order() -> None:
     found = assemblies_of(NAMES)
     assert list(found.items()) == [("body", [7, 4, 2]), ("body/door", [7, 4]), ("engine", [9])]
 
 
-def test_a_search_holds_each_word_in_any_case_and_ranks_last_elements_first() -> None:
+def test_found_ids_words_any_case_ranked() -> None:
     assert found_ids(NAMES, "DOOR") == [7, 4]
     assert found_ids(NAMES, "h") == [4, 2]
     assert found_ids(NAMES, "body gl") == [7]

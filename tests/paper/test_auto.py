@@ -51,7 +51,7 @@ def keep_figures(store: Store, model: CostModel) -> None:
     ("model", "n_points", "used"),
     [(ONE_RANGE, 3000, "cbgroup"), (NO_GAP_CLOSED, 3000, "array"), (ONE_RANGE, 500, "array")],
 )
-def test_auto_names_what_it_used_and_answers_as_every_strategy(
+def test_touch_auto_equals_named_strategy(
     tmp_path: Path, layout: Layout, model: CostModel, n_points: int, used: str
 ) -> None:
     with make_scene(tmp_path / "e.db", layout) as env:
@@ -72,7 +72,7 @@ def test_auto_names_what_it_used_and_answers_as_every_strategy(
             assert touch.pairs.tolist() == auto.pairs.tolist()
 
 
-def test_a_frame_is_asked_in_the_same_way_whatever_came_before_it(tmp_path: Path) -> None:
+def test_touch_auto_independent_of_history(tmp_path: Path) -> None:
     with make_scene(tmp_path / "e.db", "voxel") as env:
         keep_figures(env.store, ONE_RANGE)
         far = middle(env)
@@ -86,9 +86,7 @@ def test_a_frame_is_asked_in_the_same_way_whatever_came_before_it(tmp_path: Path
 
 
 @pytest.mark.parametrize("change", [{"statemenp": 1.0}, {"rows_per_block": 0.0}])
-def test_costs_of_other_names_or_values_are_damage(
-    tmp_path: Path, change: dict[str, float]
-) -> None:
+def test_touch_damaged_costs(tmp_path: Path, change: dict[str, float]) -> None:
     with make_scene(tmp_path / "e.db") as env:
         env.store.save_costs(machine_name(), ONE_RANGE.figures() | change)
         with pytest.raises(hapticdb.errors.DamagedError, match="info --calibrate"):

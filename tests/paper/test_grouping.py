@@ -44,16 +44,14 @@ def definition_of_maxgap(keys: list[int], gap: int) -> list[tuple[int, int]]:
     gap=st.one_of(st.integers(0, 20), st.integers(0, 2**70)),
 )
 @example(keys=[0, 2**62 + 1, LARGEST], gap=2**70)
-def test_neighbours_share_a_range_if_and_only_if_they_are_maxgap_apart(
-    keys: list[int], gap: int
-) -> None:
+def test_maxgap_equals_definition(keys: list[int], gap: int) -> None:
     array = as_keys(keys)
     assert as_pairs(maxgap(array, array, array, gap)) == definition_of_maxgap(keys, gap)
 
 
 @few
 @given(voxels=key_lists(st.integers(0, 20 * 512), 60), gap=st.integers(0, 3000))
-def test_gaps_are_voxel_keys_on_bricks(voxels: list[int], gap: int) -> None:
+def test_maxgap_bricks_equal_voxel_keys(voxels: list[int], gap: int) -> None:
     """Two bricks share a range if and only if voxels of both share one on the voxel layout."""
     under: dict[int, list[int]] = {}
     for voxel in voxels:
@@ -130,7 +128,7 @@ def scenes() -> st.SearchStrategy[tuple[list[int], QuantileVector]]:
     descent=12.0,
     row=1.0,
 )
-def test_cost_based_grouping_costs_the_least_of_all_groupings(
+def test_cbgroup_optimal_cost(
     scene: tuple[list[int], QuantileVector], descent: float, row: float
 ) -> None:
     keys, quantiles = scene
@@ -141,7 +139,7 @@ def test_cost_based_grouping_costs_the_least_of_all_groupings(
     assert found in list(all_groupings(keys))
 
 
-def test_a_gap_that_costs_as_much_as_a_descent_is_closed() -> None:
+def test_cbgroup_closes_gap_at_equal_cost() -> None:
     quantiles = QuantileVector(as_keys([0, 8, 16]), 16)  # one row a key
     keys = as_keys([1, 6])  # four keys between
     assert len(cbgroup(keys, keys, quantiles, costs_of(4.0, 1.0)).lows) == 1

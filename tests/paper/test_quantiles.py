@@ -40,7 +40,7 @@ def vector_of(keys: list[int], resolution: int) -> QuantileVector:
 
 @few
 @given(keys=KEYS, resolution=st.integers(1, 250), unit=st.tuples(st.floats(0, 1), st.floats(0, 1)))
-def test_expected_rows_are_off_by_two_buckets_at_most(
+def test_rows_between_error_at_most_two_buckets(
     keys: list[int], resolution: int, unit: tuple[float, float]
 ) -> None:
     """The error is one bucket at each end, however many rows share a key."""
@@ -52,7 +52,7 @@ def test_expected_rows_are_off_by_two_buckets_at_most(
 
 
 @pytest.mark.parametrize("resolution", [0, -1, MAX_RESOLUTION + 1])
-def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: int) -> None:
+def test_quantiles_resolution_out_of_range(scene: Environment, resolution: int) -> None:
     with pytest.raises(UsageError, match=f"{resolution} quantiles"):
         scene.quantiles(resolution)
 
@@ -60,7 +60,7 @@ def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: in
 MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0)
 
 
-def test_cautious_grouping_closes_fewer_gaps() -> None:
+def test_cbgroup_caution_closes_fewer_gaps() -> None:
     keys = np.arange(0, 4000, 40, dtype=np.int64)
     quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 40 * 4)  # 1.56 rows a gap
     assert len(cbgroup(keys, keys, quantiles, replace(MODEL, caution=1.0)).lows) == 1
@@ -82,7 +82,7 @@ def scene(
         yield env
 
 
-def test_calibrated_figures_are_finite_and_not_negative(scene: Environment) -> None:
+def test_calibrate_finite_non_negative(scene: Environment) -> None:
     model = calibrate(scene.store, repeats=1, budget=0.0)
     for name, value in model.figures().items():
         assert math.isfinite(value), name
@@ -92,7 +92,7 @@ def test_calibrated_figures_are_finite_and_not_negative(scene: Environment) -> N
     assert set(model.spread) <= set(vars(model))
 
 
-def test_figures_that_may_not_be_negative_are_fitted_as_scipy_fits_them() -> None:
+def test_calibrate_non_negative_fit_equals_scipy() -> None:
     rng = np.random.default_rng(4)
     n_zero = 0
     for _ in range(50):
@@ -106,7 +106,7 @@ def test_figures_that_may_not_be_negative_are_fitted_as_scipy_fits_them() -> Non
     assert n_zero > 10
 
 
-def test_cold_figures_are_measured_from_the_disk(scene: Environment) -> None:
+def test_calibrate_cold_reads_disk(scene: Environment) -> None:
     """Each query is preceded by emptied caches: at least one block is read for it."""
     emptied: list[None] = []
     store = scene.store
@@ -120,9 +120,7 @@ def test_cold_figures_are_measured_from_the_disk(scene: Environment) -> None:
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
 @pytest.mark.parametrize("layout", ["brick", "voxel"])
-def test_a_grid_smaller_than_a_tool_can_be_calibrated(
-    tmp_path: Path, layout: Layout, bits: int
-) -> None:
+def test_calibrate_grid_smaller_than_tool(tmp_path: Path, layout: Layout, bits: int) -> None:
     """Otherwise the first touch by `cbgroup` would fail there."""
     env = hapticdb.create(tmp_path / "e.db", Grid(0.005, (0, 0, 0), bits), layout=layout)
     write_voxels(env.store, np.full((1, 3), env.grid.side // 2))
@@ -145,9 +143,7 @@ def opened_with(scene: Environment, model: CostModel) -> Environment:
     return hapticdb.open(scene.url, read_only=True)
 
 
-def test_dear_descents_make_few_ranges_and_dear_rows_many(
-    scene: Environment, sphere: PointShell
-) -> None:
+def test_touch_cbgroup_ranges_by_costs(scene: Environment, sphere: PointShell) -> None:
     found = []
     for descent, row in ((1.0, 1e6), (1.0, 0.05), (1e6, 0.0)):
         model = replace(DEAR, descent=descent, block=0.0, row=row)

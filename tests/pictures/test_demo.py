@@ -33,7 +33,7 @@ def comparison(scene: demo.DemoScene) -> demo.Comparison:
     return demo.compare(scene)
 
 
-def test_every_strategy_agrees_on_both_layouts(comparison: demo.Comparison) -> None:
+def test_demo_strategies_agree_on_layouts(comparison: demo.Comparison) -> None:
     assert comparison.disagreed == ()
     assert comparison.compared == FRAMES * len(demo.COMPARED) * 2
     assert comparison.verdict.startswith("all agreed")
@@ -45,7 +45,7 @@ def test_every_strategy_agrees_on_both_layouts(comparison: demo.Comparison) -> N
     assert len({measured.imported.voxels for measured in comparison.layouts}) == 1
 
 
-def test_a_disagreement_is_told(
+def test_demo_disagreement_reported(
     scene: demo.DemoScene, comparison: demo.Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = demo._found
@@ -64,7 +64,7 @@ def test_a_disagreement_is_told(
     assert comparison.verdict != result.verdict
 
 
-def test_answers_has_one_of_each_kind(found: demo.Answers) -> None:
+def test_demo_answers_one_of_each_kind(found: demo.Answers) -> None:
     clash, gap, removal, force = (text for _, text in found.lines)
     assert "supply/fuel_line: overlapping, 5.67 mm" in clash
     assert "0.1257 mm apart" in gap
@@ -75,7 +75,7 @@ def test_answers_has_one_of_each_kind(found: demo.Answers) -> None:
 
 
 @pytest.mark.long
-def test_the_picture_shows_the_scene(
+def test_demo_picture_shows_scene(
     scene: demo.DemoScene, found: demo.Answers, tmp_path: Path
 ) -> None:
     demo_picture.draw(tmp_path / "demo.png", scene, found)
@@ -87,7 +87,7 @@ def test_the_picture_shows_the_scene(
 
 
 @pytest.mark.long
-def test_a_second_demo_finds_its_environments_there(
+def test_demo_repeated_reuses_environments(
     scene: demo.DemoScene, capfd: pytest.CaptureFixture[str]
 ) -> None:
     code = main(["demo", str(scene.folder), "--bits", "7", "--frames", "20", "--points", "60"])
@@ -102,6 +102,6 @@ def test_a_second_demo_finds_its_environments_there(
     assert len(err.splitlines()) == 2
 
 
-def test_another_grid_in_the_same_folder_is_refused(scene: demo.DemoScene) -> None:
+def test_demo_prepare_other_grid(scene: demo.DemoScene) -> None:
     with pytest.raises(UsageError, match="give another folder"):
         demo.prepare(scene.folder, bits=6, frames=20)

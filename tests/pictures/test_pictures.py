@@ -23,7 +23,7 @@ def plate(height: float, slope: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("up", [0, 1, 2])
-def test_the_axis_that_points_up_does_so_in_the_picture(up: int) -> None:
+def test_canvas_up_axis(up: int) -> None:
     foot = np.array([1.0, 1.0, 1.0])
     (x0, y0, _), (x1, y1, _) = canvas(up).project(np.stack([foot, foot + np.eye(3)[up]]))
     assert y1 < y0  # pixel rows count downwards
@@ -33,7 +33,7 @@ def test_the_axis_that_points_up_does_so_in_the_picture(up: int) -> None:
 
 
 @pytest.mark.parametrize("heights", [(0.2, 0.8), (0.8, 0.2)])
-def test_the_nearer_triangle_is_seen_whatever_the_order(heights: tuple[float, float]) -> None:
+def test_canvas_nearer_triangle_visible(heights: tuple[float, float]) -> None:
     drawn = canvas()
     for height in heights:
         drawn.fill(plate(height), np.array([height, 0.0, 0.5]))
@@ -43,7 +43,7 @@ def test_the_nearer_triangle_is_seen_whatever_the_order(heights: tuple[float, fl
     assert np.asarray(drawn.picture())[0, 0].max() == 0
 
 
-def test_a_surface_towards_the_light_is_brighter() -> None:
+def test_canvas_brighter_towards_light() -> None:
     brightness = []
     for slope in (-0.3, 0.3):  # the light comes from the left, +y
         drawn = canvas()
@@ -52,13 +52,13 @@ def test_a_surface_towards_the_light_is_brighter() -> None:
     assert brightness[0] > brightness[1]
 
 
-def test_what_lies_far_before_the_boxes_is_cut_away() -> None:
+def test_canvas_near_clipping() -> None:
     drawn = canvas()
     drawn.fill(plate(0.5) + 10.0 * turned((0.50, 0.76, 0.44), 2), np.ones(3))
     assert np.asarray(drawn.picture()).max() == 0
 
 
-def test_what_most_voxels_say_is_up() -> None:
+def test_up_axis_by_most_voxels() -> None:
     grid = Grid(0.1, (0, 0, 0), 4)
 
     def votes(*said: tuple[object, int]) -> str:
@@ -80,5 +80,5 @@ def test_what_most_voxels_say_is_up() -> None:
     [(12_500.0, "12.5 km"), (4_280.0, "4280 m"), (0.1274, "0.1274 m"), (0.0067, "6.7 mm"),
      (1e-5, "10 µm"), (0.0, "0 µm")],
 )  # fmt: skip
-def test_lengths_are_in_the_unit_that_reads_best(length: float, text: str) -> None:
+def test_length_text_readable_unit(length: float, text: str) -> None:
     assert length_text(length) == text

@@ -74,9 +74,7 @@ def test_junit_findings_and_rules(run: Run, hall: Path, tmp_path: Path) -> None:
     assert outcomes(tmp_path / "b.xml") == {"clashes": [""], "rules": ["skipped", "", ""]}
 
 
-def test_junit_pairs_of_a_kind_and_pairs_that_were_not_looked_at(
-    run: Run, hall: Path, tmp_path: Path
-) -> None:
+def test_junit_kinds_and_undecided_pairs(run: Run, hall: Path, tmp_path: Path) -> None:
     assert run("clashes", hall, "--junit", tmp_path / "a.xml", "--kind", "touching")[0] == 1
     assert outcomes(tmp_path / "a.xml") == {"clashes": ["failure"], "rules": []}
     with hapticdb.open(hall) as env:
@@ -96,7 +94,7 @@ def vector(element: ET.Element | None) -> np.ndarray:
     return np.array([float(axis.text or "") for axis in element])
 
 
-def test_bcf_topics_as_the_schema_wants_them(run: Run, hall: Path, tmp_path: Path) -> None:
+def test_bcf_topics_schema_order(run: Run, hall: Path, tmp_path: Path) -> None:
     """Order of elements and required attributes as markup.xsd and visinfo.xsd of BCF 2.1."""
     assert run("clashes", hall, "--bcf", tmp_path / "a.bcfzip")[0] == 1
     with ZipFile(tmp_path / "a.bcfzip") as archive:
@@ -125,9 +123,7 @@ def test_bcf_topics_as_the_schema_wants_them(run: Run, hall: Path, tmp_path: Pat
     ]  # fmt: skip
 
 
-def test_bcf_view_selects_both_parts_and_sees_the_place(
-    run: Run, hall: Path, tmp_path: Path
-) -> None:
+def test_bcf_viewpoint_selects_and_faces_pair(run: Run, hall: Path, tmp_path: Path) -> None:
     assert run("clashes", hall, "--bcf", tmp_path / "a.bcfzip")[0] == 1
     with ZipFile(tmp_path / "a.bcfzip") as archive:
         (name,) = (name for name in archive.namelist() if name.endswith(".bcfv"))
@@ -144,9 +140,7 @@ def test_bcf_view_selects_both_parts_and_sees_the_place(
     assert np.linalg.norm(np.cross(away, ahead)) < 0.5 * float(view[1][3].text or "")
 
 
-def test_bcf_guids_stay_and_an_accepted_topic_is_closed(
-    run: Run, hall: Path, tmp_path: Path
-) -> None:
+def test_bcf_guids_stable_and_accepted_closed(run: Run, hall: Path, tmp_path: Path) -> None:
     found = []
     for name, words in (("a", []), ("b", ["--accept", "1", "2", "--because", "cast"]), ("c", [])):
         if words:
@@ -160,7 +154,7 @@ def test_bcf_guids_stay_and_an_accepted_topic_is_closed(
     assert [topic.get("TopicStatus") for topic in found] == ["Open", "Closed", "Closed"]
 
 
-def test_reports_are_refused_where_they_cannot_be(run: Run, hall: Path, tmp_path: Path) -> None:
+def test_reports_refused_arguments(run: Run, hall: Path, tmp_path: Path) -> None:
     (tmp_path / "a.xml").touch()
     refused(run("clashes", hall, "--junit", tmp_path / "a.xml"), "--junit", "not there yet")
     moving = ("--of", "1", "--turn", "z", "--bcf", "a.bcfzip")

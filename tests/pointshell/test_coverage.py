@@ -33,7 +33,7 @@ def farthest(triangles: Floats, points: Floats) -> float:
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.007])
-def test_a_shell_of_a_spacing_has_points_about_so_far_apart(spacing: float) -> None:
+def test_shell_spacing(spacing: float) -> None:
     box = trimesh.creation.box((0.1, 0.08, 0.06))
     shell = PointShell.from_mesh(box.vertices, box.faces, spacing=spacing)
     assert len(shell) == max(300, int(np.ceil(2.0 * box.area / (np.sqrt(3.0) * spacing**2))))
@@ -44,7 +44,7 @@ def test_a_shell_of_a_spacing_has_points_about_so_far_apart(spacing: float) -> N
 
 
 @pytest.mark.parametrize("spacing", [0.0, -1.0, np.nan, np.inf])
-def test_a_spacing_that_is_none_is_refused(spacing: float) -> None:
+def test_shell_bad_spacing(spacing: float) -> None:
     box = trimesh.creation.box((0.1, 0.08, 0.06))
     with pytest.raises(UsageError, match="spacing"):
         PointShell.from_mesh(box.vertices, box.faces, spacing=spacing)
@@ -59,7 +59,7 @@ def boxes(*many: tuple[float, float]) -> trimesh.Trimesh:
 
 
 @given(places=st.lists(st.tuples(*[st.floats(-1.6, 1.6)] * 3), min_size=1, max_size=20))
-def test_inside_is_what_closed_bodies_enclose_without_their_voids(places: list[Any]) -> None:
+def test_interior_closed_bodies_without_voids(places: list[Any]) -> None:
     # a cube with a void and a cube in the void; another overlaps it from the right
     many = boxes((2.0, 0.0), (1.2, 0.0), (0.4, 0.0), (1.0, 0.9))
     interior = Interior(orient(np.array(many.triangles)))
@@ -80,7 +80,7 @@ def test_inside_is_what_closed_bodies_enclose_without_their_voids(places: list[A
     assert (depth[sure] == expected[sure]).all()
 
 
-def test_an_open_surface_encloses_nothing() -> None:
+def test_interior_open_surface_empty() -> None:
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     assert Interior(orient(np.array(box.triangles)))
     torn = Interior(orient(np.array(box.triangles[:-1])))

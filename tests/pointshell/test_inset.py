@@ -51,7 +51,7 @@ def nearest_to(points: Floats, positions: Floats) -> Floats:
     return np.asarray(cKDTree(points).query(positions)[0])
 
 
-def test_faces_of_a_box_are_drawn_in_exactly_and_its_edges_touch_late() -> None:
+def test_inset_box_faces_exact() -> None:
     shell = PointShell.from_mesh(*box((1, 1, 1)), 3000, inset=INSET)
     depth = np.minimum(shell.points, 1.0 - shell.points)
     assert depth.min() >= NEAR
@@ -72,7 +72,7 @@ def test_faces_of_a_box_are_drawn_in_exactly_and_its_edges_touch_late() -> None:
 
 
 @pytest.mark.parametrize("degrees", [15.0, 55.0])
-def test_a_sharp_wedge_keeps_its_points_as_far_in_as_they_can_go(degrees: float) -> None:
+def test_inset_sharp_wedge_maximal_depth(degrees: float) -> None:
     corners, faces = wedge(degrees)
     shell = PointShell.from_mesh(corners, faces, 2000, inset=INSET)
     edge = np.stack([np.zeros(40), np.linspace(0.3, 1.2, 40), np.zeros(40)], axis=1)
@@ -86,7 +86,7 @@ def test_a_sharp_wedge_keeps_its_points_as_far_in_as_they_can_go(degrees: float)
     assert np.allclose(shell.inset[middle], deep, atol=0.03 * INSET)
 
 
-def test_a_thin_plate_is_drawn_in_by_half_its_thickness_up_to_its_rim() -> None:
+def test_inset_thin_plate_half_thickness() -> None:
     shell = PointShell.from_mesh(*box((1, 1, 0.08)), 500, inset=INSET)
     assert np.allclose(shell.points[:, 2], 0.04, atol=0.002)
     assert np.allclose(shell.inset, 0.04, atol=0.002)
@@ -95,7 +95,7 @@ def test_a_thin_plate_is_drawn_in_by_half_its_thickness_up_to_its_rim() -> None:
     assert np.allclose(high, 0.96, atol=0.02)
 
 
-def test_an_open_sheet_stays_where_it_is() -> None:
+def test_inset_open_sheet_unchanged() -> None:
     corners, faces = sphere(n=800)
     cap = faces[(corners[faces][:, :, 2] > 0.8).all(axis=1)]
     there, shell = (PointShell.from_mesh(corners, cap, 200, inset=d) for d in (0.0, INSET))
@@ -104,7 +104,7 @@ def test_an_open_sheet_stays_where_it_is() -> None:
     assert nearest_to(shell.points, there.points).max() < 0.15
 
 
-def test_a_solid_with_a_hole_in_its_surface_is_drawn_in_like_a_whole_one() -> None:
+def test_inset_solid_with_hole() -> None:
     corners, faces = sphere(n=800)
     torn = faces[3:]
     shell = PointShell.from_mesh(corners, torn, 300, inset=INSET)
@@ -113,7 +113,7 @@ def test_a_solid_with_a_hole_in_its_surface_is_drawn_in_like_a_whole_one() -> No
     assert np.mean(np.abs(radii - (1.0 - INSET)) < 0.01) > 0.98
 
 
-def test_bodies_close_to_one_another_are_drawn_in_like_single_ones() -> None:
+def test_inset_close_bodies_separate() -> None:
     pair = together(box((1, 1, 1)), box((1, 1, 1), at=(1.03, 0, 0)))
     shell = PointShell.from_mesh(*pair, 1000, inset=INSET)
     local = np.where(shell.points[:, :1] > 1.015, shell.points - (1.03, 0, 0), shell.points)
@@ -124,7 +124,7 @@ def test_bodies_close_to_one_another_are_drawn_in_like_single_ones() -> None:
 
 
 @pytest.mark.parametrize("wall", [0.3, 0.1])
-def test_points_stay_in_the_wall_around_a_void(wall: float) -> None:
+def test_inset_hollow_body_stays_in_wall(wall: float) -> None:
     hollow = 1.0 - 2.0 * wall
     tool = together(box((1, 1, 1)), box((hollow, hollow, hollow), at=(wall, wall, wall)))
     shell = PointShell.from_mesh(*tool, 1000, inset=INSET)
@@ -141,9 +141,7 @@ def test_points_stay_in_the_wall_around_a_void(wall: float) -> None:
 @example(seed=1, n=4, share=0.5)  # an edge below 8 degrees
 @example(seed=152, n=4, share=0.5)  # samples that lie 4e-5 insets from the other side of an edge
 @settings(max_examples=3, deadline=None)
-def test_random_convex_bodies_keep_the_inset_and_leave_no_part_without_points(
-    seed: int, n: int, share: float
-) -> None:
+def test_inset_random_convex_bodies_covered(seed: int, n: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     corners, faces = hull_of(rng.normal(size=(n, 3)) * rng.uniform(0.2, 1.0, 3))
     size = float(np.ptp(corners, axis=0).min())
@@ -161,7 +159,7 @@ def test_random_convex_bodies_keep_the_inset_and_leave_no_part_without_points(
 
 
 @pytest.mark.parametrize("degrees", [0.2, 3.0])
-def test_no_point_leaves_a_wedge_through_its_sharp_edge(degrees: float) -> None:
+def test_inset_points_inside_sharp_wedge(degrees: float) -> None:
     """Near the edge the other side is nearer than any share of the inset."""
     corners, faces = wedge(degrees)
     shell = PointShell.from_mesh(corners, faces, 1000, inset=0.02)
@@ -170,7 +168,7 @@ def test_no_point_leaves_a_wedge_through_its_sharp_edge(degrees: float) -> None:
 
 
 @pytest.mark.parametrize("sides", [(0.01, 0.01, 0.01), (0.2, 0.01, 0.01), (0.2, 0.2, 0.01)])
-def test_tools_smaller_than_the_inset_keep_their_number_of_points(
+def test_inset_small_tools_point_count(
     sides: tuple[float, float, float],
 ) -> None:
     shell = PointShell.from_mesh(*box(sides), 50, inset=INSET)
@@ -178,7 +176,7 @@ def test_tools_smaller_than_the_inset_keep_their_number_of_points(
     assert (np.minimum(shell.points, sides - shell.points) >= 0.003).all()
 
 
-def test_a_shell_keeps_how_far_it_was_drawn_in(tmp_path: Path) -> None:
+def test_inset_saved_with_shell(tmp_path: Path) -> None:
     shell = PointShell.from_mesh(*wedge(40.0), 100, inset=INSET)
     shell.save(tmp_path / "tool.npz")
     saved = PointShell.from_file(tmp_path / "tool.npz")
@@ -190,7 +188,7 @@ def test_a_shell_keeps_how_far_it_was_drawn_in(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("inset", [-1.0, np.nan, np.inf])
-def test_an_inset_that_is_no_length_is_refused(inset: float) -> None:
+def test_inset_bad_values(inset: float) -> None:
     with pytest.raises(UsageError, match="an inset of"):
         PointShell.from_mesh(*box((1, 1, 1)), 10, inset=inset)
     shell = PointShell.from_mesh(*box((1, 1, 1)), 10)
@@ -223,7 +221,7 @@ def free_clearance(shell: PointShell, radius: float) -> float:
 
 
 @pytest.mark.parametrize("radius", [6.0, 20.0])
-def test_a_peg_drawn_in_by_the_onset_moves_freely_in_a_close_hole(radius: float) -> None:
+def test_inset_peg_moves_in_close_hole(radius: float) -> None:
     # Lengths in voxels. The axis of peg and hole is that of the lattice: corners at its centre.
     corners, faces = cylinder(radius, 30.0, n=128)
     drawn, plain = (PointShell.from_mesh(corners, faces, 400, inset=d) for d in (1.5, 0.0))

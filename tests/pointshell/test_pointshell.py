@@ -74,7 +74,7 @@ def cube_inward(points: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 300, 1000])
-def test_a_shell_has_exactly_the_points_asked_for(n: int) -> None:
+def test_shell_point_count(n: int) -> None:
     shell = PointShell.from_mesh(*cube(), n)
     assert len(shell) == n
     assert shell.points.shape == shell.normals.shape == (n, 3)
@@ -82,7 +82,7 @@ def test_a_shell_has_exactly_the_points_asked_for(n: int) -> None:
     assert shell.normals.flags.c_contiguous
 
 
-def test_points_lie_on_the_surface_and_normals_of_a_cube_are_exact() -> None:
+def test_shell_points_on_surface_exact_normals() -> None:
     shell = PointShell.from_mesh(*tumbled(cube()), 500)
     sides = np.minimum(np.abs(shell.points), np.abs(shell.points - 1.0)).min(axis=1)
     assert sides.max() <= 1e-15
@@ -92,14 +92,14 @@ def test_points_lie_on_the_surface_and_normals_of_a_cube_are_exact() -> None:
 
 
 @pytest.mark.parametrize("n", [100, 3000])
-def test_neighbours_keep_six_tenths_of_the_hexagonal_spacing(n: int) -> None:
+def test_shell_neighbour_spacing(n: int) -> None:
     points = PointShell.from_mesh(*sphere(), n).points
     nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1]
     area = ConvexHull(sphere()[0]).area
     assert nearest.min() > 0.6 * np.sqrt(2.0 * area / (np.sqrt(3.0) * n))
 
 
-def test_both_sides_of_a_thin_wall_get_their_share() -> None:
+def test_shell_thin_wall_share_of_points() -> None:
     corners, faces = cube()
     fin = (corners * (2.0, 1.0, 0.004) + (1.5, 0.0, 0.0), faces)
     points = PointShell.from_mesh(*together((corners, faces), fin), 3000).points
@@ -109,7 +109,7 @@ def test_both_sides_of_a_thin_wall_get_their_share() -> None:
 
 @given(seed=st.integers(0, 2**32), shift=st.integers(-3, 3))
 @settings(max_examples=15, deadline=None)
-def test_a_moved_tool_has_a_moved_shell(seed: int, shift: int) -> None:
+def test_shell_invariant_under_rigid_motion(seed: int, shift: int) -> None:
     corners, faces = torus(n=12)
     turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     offset = np.array([shift, -2.0 * shift, 0.5])
@@ -123,7 +123,7 @@ def test_a_moved_tool_has_a_moved_shell(seed: int, shift: int) -> None:
     assert np.allclose(there.center, turn @ here.center + offset, atol=1e-12)
 
 
-def test_equal_seeds_give_equal_shells_and_others_do_not() -> None:
+def test_shell_seed_reproducible() -> None:
     first, again, other = (PointShell.from_mesh(*torus(), 200, seed=s) for s in (5, 5, 6))
     assert np.array_equal(first.points, again.points)
     assert np.array_equal(first.normals, again.normals)
@@ -136,7 +136,7 @@ def mean_step(points: Floats) -> float:
 
 
 @pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (30.0, 1.0, 1.0), (1.0, 1.0, 0.01)])
-def test_points_next_to_each_other_by_index_are_close_in_space(
+def test_shell_order_spatially_coherent(
     stretch: tuple[float, float, float],
 ) -> None:
     corners, faces = torus()
@@ -147,14 +147,14 @@ def test_points_next_to_each_other_by_index_are_close_in_space(
     assert mean_step(points) < 3.0 * nearest.mean()
 
 
-def test_a_rounding_of_the_frame_leaves_the_order() -> None:
+def test_shell_order_stable_under_rounding() -> None:
     # A cube's points lie at the ends of their bounding box, where no step of the curve may end.
     here, there = (PointShell.from_mesh(*cube(at=(x, 0.0, 0.0)), 500) for x in (0.0, 0.1))
     assert np.allclose(there.points, here.points + np.array([0.1, 0.0, 0.0]), atol=1e-12)
 
 
 @pytest.mark.parametrize("state", ["outward", "inside out", "tumbled", "mirrored", "doubled"])
-def test_normals_point_inward_whatever_the_winding(state: str) -> None:
+def test_shell_normals_inward_any_winding(state: str) -> None:
     corners, faces = torus()
     if state == "inside out":
         faces = faces[:, ::-1]
@@ -172,7 +172,7 @@ def test_normals_point_inward_whatever_the_winding(state: str) -> None:
     assert np.allclose(shell.center, 0.0, atol=1e-12)
 
 
-def test_in_a_cavity_inward_is_away_from_the_void() -> None:
+def test_shell_normals_in_cavity() -> None:
     hole = cube(0.5, (0.1, 0.25, 0.25))
     shell = PointShell.from_mesh(*tumbled(together(cube(), hole)), 800)
     in_hole = (np.abs(shell.points - 0.5) < 0.45).all(axis=1)
@@ -186,7 +186,7 @@ def test_in_a_cavity_inward_is_away_from_the_void() -> None:
 
 
 @pytest.mark.parametrize("gap", [2.0, 1.0, 0.5])
-def test_bodies_apart_glued_or_overlapping_each_have_their_inside(gap: float) -> None:
+def test_shell_bodies_apart_joined_overlapping(gap: float) -> None:
     pair = together(cube(), cube(at=(gap, 0.0, 0.0)))
     shell = PointShell.from_mesh(*tumbled(pair), 1000)
     assert shell.is_closed
@@ -199,7 +199,7 @@ def test_bodies_apart_glued_or_overlapping_each_have_their_inside(gap: float) ->
         assert (shell.normals[shell.points[:, 0] == 1.0, 0] == -1.0).all()
 
 
-def test_a_face_that_a_body_shares_with_one_around_it_is_kept() -> None:
+def test_shell_face_of_enclosed_body() -> None:
     """It is a wall between two bodies only if they lie on either side of it."""
     corners, faces = cube()
     pair = together((corners, faces), (corners * (1.0, 1.0, 0.5), faces))
@@ -209,7 +209,7 @@ def test_a_face_that_a_body_shares_with_one_around_it_is_kept() -> None:
         assert (shell.points[:, axis] == level).sum() > 50
 
 
-def test_an_open_hemisphere_faces_its_hollow_and_says_that_it_is_open() -> None:
+def test_shell_open_hemisphere() -> None:
     corners, faces = sphere(n=2000)
     faces = faces[(corners[faces][:, :, 2] >= 0.0).all(axis=1)]
     shell = PointShell.from_mesh(*tumbled((corners, faces)), 300)
@@ -219,7 +219,7 @@ def test_an_open_hemisphere_faces_its_hollow_and_says_that_it_is_open() -> None:
     assert np.allclose(shell.center, [0.0, 0.0, 0.5], atol=0.03)
 
 
-def test_a_flat_sheet_of_random_winding_faces_one_way() -> None:
+def test_shell_flat_sheet_one_normal() -> None:
     corners, faces = cube(4.5)
     for _ in range(3):
         corners, faces = trimesh.remesh.subdivide(corners, faces)
@@ -230,14 +230,14 @@ def test_a_flat_sheet_of_random_winding_faces_one_way() -> None:
     assert np.allclose(shell.center, [2.25, 2.25, 0.0])
 
 
-def test_corners_that_differ_by_a_rounding_are_joined() -> None:
+def test_shell_corners_joined_within_tolerance() -> None:
     corners, faces = tumbled(sphere())
     noise = np.random.default_rng(3).uniform(-1e-7, 1e-7, corners.shape)
     assert PointShell.from_mesh(corners + noise, faces, 50).is_closed
     assert not PointShell.from_mesh(corners + 1e3 * noise, faces, 50).is_closed
 
 
-def test_degenerate_faces_change_nothing() -> None:
+def test_shell_degenerate_faces() -> None:
     corners, faces = cube()
     needles = np.array([[0, 0, 1], [2, 2, 2], [0, 7, 7]])
     clean, dirty = (
@@ -247,7 +247,7 @@ def test_degenerate_faces_change_nothing() -> None:
     assert dirty.is_closed
 
 
-def test_far_from_the_origin_nothing_is_lost() -> None:
+def test_shell_far_from_origin() -> None:
     corners, faces = torus()
     far = np.array([4.5e6, 5.4e6, 500.0])
     shell = PointShell.from_mesh(corners + far, faces, 200)
@@ -256,7 +256,7 @@ def test_far_from_the_origin_nothing_is_lost() -> None:
 
 
 @pytest.mark.parametrize("points", [0, -1, 10_000_001])
-def test_a_number_of_points_out_of_range_is_a_usage_error(points: int) -> None:
+def test_shell_bad_point_count(points: int) -> None:
     with pytest.raises(UsageError, match="points"):
         PointShell.from_mesh(*cube(), points)
 
@@ -272,12 +272,12 @@ def test_a_number_of_points_out_of_range_is_a_usage_error(points: int) -> None:
         ((np.eye(2), [[0, 1, 1]]), "shape"),
     ],
 )
-def test_a_mesh_without_a_surface_is_a_usage_error(mesh: Mesh, cause: str) -> None:
+def test_shell_mesh_without_surface(mesh: Mesh, cause: str) -> None:
     with pytest.raises(UsageError, match=cause):
         PointShell.from_mesh(*mesh, 10)
 
 
-def test_a_saved_shell_loads_to_the_bit(tmp_path: Path) -> None:
+def test_shell_save_load_same_bits(tmp_path: Path) -> None:
     shell = PointShell.from_mesh(*torus(), 123, seed=9)
     path = tmp_path / "tool.shell.npz"
     shell.save(path)
@@ -290,7 +290,7 @@ def test_a_saved_shell_loads_to_the_bit(tmp_path: Path) -> None:
         PointShell.from_file(path, unit="mm")
 
 
-def test_what_is_no_saved_shell_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_shell_load_bad_file(tmp_path: Path) -> None:
     shell = PointShell.from_mesh(*cube(), 20)
     path = tmp_path / "tool.npz"
     shell.save(path)
@@ -314,7 +314,7 @@ def test_what_is_no_saved_shell_is_refused_in_one_line(tmp_path: Path) -> None:
         shell.save(tmp_path / "missing" / "tool.npz")
 
 
-def test_a_shell_by_hand_is_checked() -> None:
+def test_shell_constructor_checks() -> None:
     up = np.array([[0.0, 0.0, 1.0]])
     assert len(PointShell(np.zeros((1, 3)), up, np.zeros(3))) == 1
     for points, normals, center in (
@@ -329,7 +329,7 @@ def test_a_shell_by_hand_is_checked() -> None:
             PointShell(points, normals, center)
 
 
-def test_a_file_keeps_its_frame_and_its_unit(tmp_path: Path) -> None:
+def test_shell_from_file_frame_and_unit(tmp_path: Path) -> None:
     path = write_stl(tmp_path / "tool.stl", tumbled(cube(at=(3.0, 4.0, 5.0))))
     shell = PointShell.from_file(path, 100)
     assert np.allclose(shell.center, [3.5, 4.5, 5.5])
@@ -339,7 +339,7 @@ def test_a_file_keeps_its_frame_and_its_unit(tmp_path: Path) -> None:
     assert np.allclose(small.points, 1e-3 * shell.points, atol=1e-12)
 
 
-def test_a_file_without_a_surface_is_named(tmp_path: Path) -> None:
+def test_shell_from_file_without_surface(tmp_path: Path) -> None:
     corners, faces = cube()
     flat = write_stl(tmp_path / "line.stl", (corners * (1.0, 0.0, 0.0), faces))
     with pytest.raises(FileError, match=r"line\.stl.*no area"):
@@ -357,7 +357,7 @@ def test_a_file_without_a_surface_is_named(tmp_path: Path) -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(st.data())
-def test_components_are_numbered_by_their_lowest_nodes(data: st.DataObject) -> None:
+def test_components_equal_scipy(data: st.DataObject) -> None:
     n = data.draw(st.integers(1, 30))
     node = st.integers(0, n - 1)
     pairs = np.array(data.draw(st.lists(st.tuples(node, node))), np.int64).reshape(-1, 2)

@@ -78,9 +78,7 @@ def entries() -> list[Path]:
 
 
 @pytest.mark.parametrize("is_open", [False, True])
-def test_a_kept_tool_has_the_bits_of_a_fresh_one(
-    file: Path, is_read: Callable[[], bool], is_open: bool
-) -> None:
+def test_tool_cache_hit_same_bits(file: Path, is_read: Callable[[], bool], is_open: bool) -> None:
     ball(file, is_open=is_open)
     fresh = made_tool(str(file), 50, unit="mm", seed=3, inset=1e-3 * INSET)
     tool(file, unit="mm", seed=3, inset=1e-3 * INSET)
@@ -101,7 +99,7 @@ def test_a_kept_tool_has_the_bits_of_a_fresh_one(
             assert one == other, field.name
 
 
-def test_another_request_is_another_entry(file: Path, is_read: Callable[[], bool]) -> None:
+def test_tool_cache_key_of_options(file: Path, is_read: Callable[[], bool]) -> None:
     tool(file)
     assert is_read()
     changes: list[dict[str, Any]] = [
@@ -113,7 +111,7 @@ def test_another_request_is_another_entry(file: Path, is_read: Callable[[], bool
         assert (is_read(), len(entries())) == (True, n), change
 
 
-def test_an_edit_of_the_file_or_of_the_sources_makes_the_tool_anew(
+def test_tool_cache_invalidated_by_edits(
     file: Path, is_read: Callable[[], bool], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = tool(file)
@@ -135,7 +133,7 @@ def _make_folder(entry: Path) -> None:
     entry.mkdir()
 
 
-def test_a_damaged_entry_is_made_anew(file: Path, is_read: Callable[[], bool]) -> None:
+def test_tool_cache_damaged_entry(file: Path, is_read: Callable[[], bool]) -> None:
     before = tool(file)
     damages: list[Callable[[Path], object]] = [
         lambda entry: entry.write_bytes(b""),
@@ -151,9 +149,7 @@ def test_a_damaged_entry_is_made_anew(file: Path, is_read: Callable[[], bool]) -
         assert is_read(), n
 
 
-def test_files_that_the_tool_refers_to_are_looked_at(
-    file: Path, is_read: Callable[[], bool]
-) -> None:
+def test_tool_cache_referenced_files(file: Path, is_read: Callable[[], bool]) -> None:
     inner = json.loads(gltf({}, file.with_name("inner.gltf")).read_text())
     corners = np.concatenate([TRIANGLE.reshape(-1), np.arange(3, dtype=np.uint32).view(np.float32)])
     buffer = file.with_name("corners.bin")
@@ -174,7 +170,7 @@ def test_files_that_the_tool_refers_to_are_looked_at(
         tool(outer, inset=0.0)
 
 
-def test_a_file_that_appears_beside_the_tool_changes_what_is_told(file: Path) -> None:
+def test_tool_cache_missing_file_appears(file: Path) -> None:
     file.write_text("mtllib paint.mtl\n" + file.read_text())
     assert "paint.mtl" in tool(file).shell.defects
     assert "paint.mtl" in tool(file).shell.defects
@@ -182,15 +178,13 @@ def test_a_file_that_appears_beside_the_tool_changes_what_is_told(file: Path) ->
     assert "paint.mtl" not in tool(file).shell.defects
 
 
-def test_a_file_that_is_written_while_it_is_read_is_not_kept(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tool_cache_skips_file_being_written(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "time", lambda: file.stat().st_ctime)
     tool(file)
     assert not entries()
 
 
-def test_the_entries_that_were_used_last_stay(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tool_cache_evicts_least_recently_used(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tool(file)
     (first,) = entries()
     tool(file, seed=1)
@@ -208,9 +202,7 @@ def test_the_entries_that_were_used_last_stay(file: Path, monkeypatch: pytest.Mo
     assert len(entries()) == 2
 
 
-def test_a_cache_that_cannot_be_written_is_done_without(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tool_cache_unwritable(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(user_cache, "cache_folder", lambda: file)
     assert len(tool(file).shell) == 50
 
@@ -221,7 +213,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(
     assert len(tool(file).shell) == 50
 
 
-def test_what_cannot_be_made_is_refused_as_without_a_cache(file: Path, tmp_path: Path) -> None:
+def test_tool_cache_bad_arguments(file: Path, tmp_path: Path) -> None:
     tool(file, points=None)
     with pytest.raises(UsageError, match="0 points"):
         tool(file, points=0)

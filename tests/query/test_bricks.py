@@ -67,7 +67,7 @@ def memory_of(env: Environment) -> BrickCache:
     return memory
 
 
-def test_frames_over_memory_have_the_bits_of_frames_that_read(env: Environment) -> None:
+def test_brick_cache_same_bits_as_reading(env: Environment) -> None:
     filters: list[list[int]] = [[], [1], [2, 3], [1, 2, 3], []]
     for law, exclude in itertools.product(LAWS, filters):
         n_contacts = check(env, law, exclude)
@@ -80,12 +80,12 @@ def test_frames_over_memory_have_the_bits_of_frames_that_read(env: Environment) 
 
 
 @pytest.mark.parametrize("curve", CURVES)
-def test_every_curve_finds_its_bricks_again(tmp_path: Path, curve: CurveName) -> None:
+def test_brick_cache_every_curve(tmp_path: Path, curve: CurveName) -> None:
     with make(str(tmp_path / "e.db"), curve) as env:
         assert all(check(env, law) > 0 for law in LAWS)
 
 
-def test_bricks_without_distances_are_kept_too(tmp_path: Path) -> None:
+def test_brick_cache_bricks_without_distances(tmp_path: Path) -> None:
     with (
         make(str(tmp_path / "e.db")) as made,
         hapticdb.create(tmp_path / "plain.db", made.grid, distances=False) as env,
@@ -98,7 +98,7 @@ def test_bricks_without_distances_are_kept_too(tmp_path: Path) -> None:
         assert check(env, "plane") > 0
 
 
-def test_every_commit_empties_the_memory(env: Environment) -> None:
+def test_brick_cache_emptied_by_commit(env: Environment) -> None:
     def by_itself() -> None:
         env.remove(3)
 
@@ -125,7 +125,7 @@ def test_every_commit_empties_the_memory(env: Environment) -> None:
         assert check(env, "distance") > 0
 
 
-def test_pairs_written_by_others_leave_the_bricks(env: Environment) -> None:
+def test_brick_cache_unaffected_by_pairs(env: Environment) -> None:
     check(env, "plane")
     n_kept = memory_of(env).n_kept
     with hapticdb.open(env.address) as other:
@@ -134,9 +134,7 @@ def test_pairs_written_by_others_leave_the_bricks(env: Environment) -> None:
     assert memory_of(env).n_kept == n_kept > 0
 
 
-def test_no_frame_mixes_bricks_of_two_revisions(
-    env: Environment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_brick_cache_no_mixed_revisions(env: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another commits between what is in memory and what a frame reads."""
     lookup, n_lookups = env.store.lookup, 0
 
@@ -159,7 +157,7 @@ def test_no_frame_mixes_bricks_of_two_revisions(
     assert_same(touch, env.touch(SHELL, POSES[1], "array"))
 
 
-def test_a_snapshot_keeps_its_revision(env: Environment) -> None:
+def test_brick_cache_snapshot_revision(env: Environment) -> None:
     env.touch(SHELL, POSES[1])
     with hapticdb.open(env.address) as other:
         with env.store.snapshot():
@@ -172,7 +170,7 @@ def test_a_snapshot_keeps_its_revision(env: Environment) -> None:
     assert 2 not in after.ids
 
 
-def test_frames_that_need_more_than_fits_are_right(
+def test_brick_cache_frames_beyond_capacity(
     env: Environment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     check(env, "distance")
@@ -203,7 +201,7 @@ def test_frames_that_need_more_than_fits_are_right(
         assert_same(one, other)
 
 
-def test_the_directory_grows_with_its_bricks(env: Environment) -> None:
+def test_brick_cache_directory_grows(env: Environment) -> None:
     memory = BrickCache(env.url)
     keys = np.arange(0, 5000 * 7, 7)
     for some in np.split(keys, 10):
@@ -213,7 +211,7 @@ def test_the_directory_grows_with_its_bricks(env: Environment) -> None:
     assert len(memory.directory) >= 2 * len(keys)
 
 
-def test_memory_is_bounded_and_taken_from_the_page_cache(tmp_path: Path) -> None:
+def test_brick_cache_memory_budget(tmp_path: Path) -> None:
     for layout in (records.OCCUPIED, records.MEASURED):
         n_rows = layout["id"].shape[0]
         directory = records.ENTRIES_A_ROW * n_rows * records.BRICK.itemsize
@@ -224,9 +222,7 @@ def test_memory_is_bounded_and_taken_from_the_page_cache(tmp_path: Path) -> None
     assert -1024 * kib + records.DECODED_BYTES == 256 << 20
 
 
-def test_damaged_distances_are_told_and_not_kept(
-    env: Environment, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_brick_cache_damaged_distances(env: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
     lookup = env.store.lookup
 
     def cut(keys: Keys, *, distances: bool = False) -> Rows:
@@ -244,7 +240,7 @@ def test_damaged_distances_are_told_and_not_kept(
     assert check(env, "distance") > 0
 
 
-def test_memory_belongs_to_the_thread_of_its_environment(env: Environment) -> None:
+def test_brick_cache_other_thread_refused(env: Environment) -> None:
     env.touch(SHELL, POSES[0])
     with (
         ThreadPoolExecutor(1) as thread,
@@ -253,7 +249,7 @@ def test_memory_belongs_to_the_thread_of_its_environment(env: Environment) -> No
         thread.submit(env.touch, SHELL, POSES[0]).result(TIMEOUT)
 
 
-def test_a_pose_that_is_not_rigid_is_refused_over_memory(env: Environment) -> None:
+def test_brick_cache_non_rigid_pose(env: Environment) -> None:
     check(env, "plane")
     with pytest.raises(UsageError, match="no rigid transform"):
         env.touch(SHELL, np.diag([2.0, 1, 1, 1]))

@@ -67,17 +67,17 @@ def check_strategies(env: Environment, curve: CurveName) -> None:
 
 
 @pytest.mark.parametrize("curve", CURVES)
-def test_every_strategy_feels_what_plain_python_feels(tmp_path: Path, curve: CurveName) -> None:
+def test_strategies_distance_law_equal_plain_python(tmp_path: Path, curve: CurveName) -> None:
     check_strategies(make(str(tmp_path / "e.db"), curve), curve)
 
 
 @pytest.mark.parametrize("curve", CURVES)
-def test_every_strategy_feels_the_same_on_a_server(place: Place, curve: CurveName) -> None:
+def test_strategies_distance_law_on_server(place: Place, curve: CurveName) -> None:
     with make(place(), curve) as env:
         check_strategies(env, curve)
 
 
-def test_gaps_are_closed_by_what_rows_cost_with_their_distances(env: Environment) -> None:
+def test_cbgroup_distance_law_row_cost(env: Environment) -> None:
     """Rows cost nothing, but with their distances they are worth more than a descent."""
     shell, pose = random_shell(1, 200), random_pose(1)
     costs = CostModel(1.0, 1.0, 0.0, 1e-9, 1.0, distances=1e15)
@@ -89,7 +89,7 @@ def test_gaps_are_closed_by_what_rows_cost_with_their_distances(env: Environment
     assert_same(distance, expected(merged(), shell, pose, []))
 
 
-def test_calibrating_measures_rows_with_their_distances(env: Environment) -> None:
+def test_calibrate_rows_with_distances(env: Environment) -> None:
     asked: list[bool] = []
     store, scan = env.store, env.store.scan
 
@@ -102,7 +102,7 @@ def test_calibrating_measures_rows_with_their_distances(env: Environment) -> Non
     assert set(asked) == {False, True}
 
 
-def test_the_default_law_follows_the_objects(env: Environment) -> None:
+def test_touch_default_law_by_objects(env: Environment) -> None:
     shell, pose = random_shell(1, 40), random_pose(1)
     assert env.touch(shell, pose).law.name == "distance"  # type: ignore[attr-defined]
     assert env.touch(shell, pose, law="plane").law.name == "plane"  # type: ignore[attr-defined]

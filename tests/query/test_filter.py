@@ -116,7 +116,7 @@ def env(
     where=WORDS,
     exclude=WORDS,
 )
-def test_all_that_touch_feel_what_a_plain_set_without_the_others_does(
+def test_touch_filter_equals_plain_set(
     env: Environment,
     plain: dict[Voxel, set[int]],
     seed: int,
@@ -149,9 +149,7 @@ def test_all_that_touch_feel_what_a_plain_set_without_the_others_does(
         ("=steel", "no object '=steel'"),
     ],
 )
-def test_a_word_that_chooses_nothing_is_one_line(
-    env: Environment, word: int | str, said: str
-) -> None:
+def test_touch_filter_unknown_word(env: Environment, word: int | str, said: str) -> None:
     shell, far = random_shell(1, 3), np.eye(4)
     far[:3, 3] = 1e6  # outside the grid, where no statement is sent
     for pose in (random_pose(1), far):
@@ -163,7 +161,7 @@ def test_a_word_that_chooses_nothing_is_one_line(
             assert "\n" not in str(told.value)
 
 
-def test_what_others_add_or_rename_is_felt_by_the_words(tmp_path: Path) -> None:
+def test_touch_filter_follows_commits(tmp_path: Path) -> None:
     """A new object is felt if the words choose it, and so is one whose attributes change."""
     shell, pose = random_shell(4, 300), np.eye(4)
     pose[:3, 3] = np.array(ORIGIN) + SIZE * np.array((22, 21, 22))

@@ -115,7 +115,7 @@ def assert_same(touch: hapticdb.Touch, wanted: NaiveTouch) -> None:
     exclude=st.lists(st.integers(1, 5), max_size=3),
     maxgap=st.sampled_from([0, 1, 7, 500, 10**5, 10**18]),
 )
-def test_every_strategy_finds_what_a_plain_set_finds(
+def test_strategies_equal_plain_set(
     env: Environment,
     plain: dict[tuple[int, int, int], set[int]],
     seed: int,
@@ -130,7 +130,7 @@ def test_every_strategy_finds_what_a_plain_set_finds(
         assert_same(touch, wanted)
 
 
-def test_maxgap_0_is_the_point_query_sequence(env: Environment) -> None:
+def test_maxgap_zero_equals_points(env: Environment) -> None:
     shell, pose = random_shell(3, 300), random_pose(3)
     points = env.touch(shell, pose, "points").query
     ranges = env.touch(shell, pose, "maxgap", maxgap=0).query
@@ -141,7 +141,7 @@ def test_maxgap_0_is_the_point_query_sequence(env: Environment) -> None:
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_points_outside_the_grid_miss_and_never_wrap(env: Environment, strategy: Strategy) -> None:
+def test_touch_points_outside_grid_no_wrap(env: Environment, strategy: Strategy) -> None:
     shell = random_shell(1, 40)
     for axis in range(3):
         for side in (-1.0, 1.0):
@@ -169,20 +169,20 @@ def test_points_outside_the_grid_miss_and_never_wrap(env: Environment, strategy:
         np.diag([1.0, 1, 1, 2]),
     ],
 )
-def test_a_pose_that_is_not_rigid_is_refused(tmp_path: Path, pose: NDArray[Any]) -> None:
+def test_touch_non_rigid_pose(tmp_path: Path, pose: NDArray[Any]) -> None:
     env = make_scene(tmp_path / "e.db", "brick", "z")
     with pytest.raises(hapticdb.errors.UsageError, match="pose"):
         env.touch(random_shell(1, 3), pose)
 
 
-def test_an_unknown_strategy_is_refused(tmp_path: Path) -> None:
+def test_touch_unknown_strategy(tmp_path: Path) -> None:
     env = make_scene(tmp_path / "e.db", "brick", "z")
     with pytest.raises(hapticdb.errors.UsageError, match="choose one of auto"):
         env.touch(random_shell(1, 3), np.eye(4), "fastest")  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize("is_file", [True, False])
-def test_a_frame_after_edits_reads_the_objects_that_they_wrote_and_no_others(
+def test_touch_reads_only_edited_objects(
     tmp_path: Path, place: Place, is_file: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = make_scene(tmp_path / "e.db" if is_file else place(), "brick", "z")
@@ -221,7 +221,7 @@ def test_a_frame_after_edits_reads_the_objects_that_they_wrote_and_no_others(
     env.close()
 
 
-def test_an_empty_environment_is_free(tmp_path: Path) -> None:
+def test_touch_empty_environment(tmp_path: Path) -> None:
     env = hapticdb.create(tmp_path / "e.db", Grid(SIZE, ORIGIN, BITS))
     for strategy in STRATEGIES:
         touch = env.touch(random_shell(1, 300), random_pose(1), strategy)
@@ -229,7 +229,7 @@ def test_an_empty_environment_is_free(tmp_path: Path) -> None:
         assert not touch.torque.any()
 
 
-def test_contacts_have_places_normals_and_depths(tmp_path: Path) -> None:
+def test_touch_contact_positions_normals_depths(tmp_path: Path) -> None:
     env = make_scene(tmp_path / "e.db", "brick", "z")
     shell, pose = random_shell(5, 300), random_pose(5)
     touch = env.touch(shell, pose)

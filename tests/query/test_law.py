@@ -93,7 +93,7 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
 @example(part=256)  # a border: the upper voxel's, where the law is at its peak
 @example(part=257)
 @example(part=8 * 256)
-def test_one_point_in_a_solid_floor_feels_a_sawtooth(
+def test_tangent_plane_sawtooth_on_floor(
     binary_floor: Environment, strategy: Strategy, part: int
 ) -> None:
     """F_z = K max(0, u - s (ceil(u / s) - 1) - s / 2), of peak K s / 2."""
@@ -107,7 +107,7 @@ def test_one_point_in_a_solid_floor_feels_a_sawtooth(
     assert touch.contacts.tolist() == ([0] if within > BINARY / 2 else [])
 
 
-def test_a_point_on_a_border_belongs_to_the_upper_voxel(binary_floor: Environment) -> None:
+def test_tangent_plane_point_on_voxel_border(binary_floor: Environment) -> None:
     """No hit at z = 0; a hit at the underside of the floor, and none a hair below that."""
     for height, is_hit in ((0.0, False), (-8 * BINARY, True), (-8 * BINARY - 2.0**-20, False)):
         touch = binary_floor.touch(shell_of([0, 0, height]), np.eye(4))
@@ -132,7 +132,7 @@ def punch(n_points: int, spacing: float = 0.0031) -> Array:
 
 @strategies
 @pytest.mark.parametrize(("n_points", "force"), [(4, 6.0), (9, 13.5), (10, 15.0), (100, 15.0)])
-def test_a_flat_punch_feels_its_points_averaged_from_ten_on(
+def test_tangent_plane_punch_averaged_from_ten_points(
     floor: Environment, strategy: Strategy, n_points: int, force: float
 ) -> None:
     """u = 4 mm, s = 5 mm: 1.5 N a point; torque 0 about the middle, e F about e aside."""
@@ -150,7 +150,7 @@ def test_a_flat_punch_feels_its_points_averaged_from_ten_on(
     ("n_deep", "n_shallow", "divisor"), [(8, 1, 1.0), (8, 2, 1.0), (8, 12, 2.0), (1, 29, 3.0)]
 )
 @strategies
-def test_the_average_counts_hits_and_not_contacts(
+def test_tangent_plane_average_over_hits(
     floor: Environment, strategy: Strategy, n_deep: int, n_shallow: int, divisor: float
 ) -> None:
     """Shallow points hit above the tangent plane; free ones do not count."""
@@ -174,7 +174,7 @@ def mirrored(vectors: Array) -> Array:
     return images
 
 
-def test_a_peg_centred_in_a_hole_feels_no_lateral_force_and_no_torque(tmp_path: Path) -> None:
+def test_tangent_plane_centred_peg_no_lateral_force(tmp_path: Path) -> None:
     """The peg is wider than the hole by less than half a voxel on each side."""
     floor = floor_voxels(grid_of(SIZE))
     is_wall = (np.abs(floor[:, :2] + 0.5 - MIDDLE) > 4).any(axis=1)
@@ -226,7 +226,7 @@ BLOB = blob(3, (30, 34, 31))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int) -> None:
+def test_tangent_plane_rotation_equivariant(tmp_path: Path, axis: int) -> None:
     """Tool and environment are turned together, by 90 degrees about a vertex of the grid."""
     turn = quarter_turn(axis)
     turned = np.round((BLOB + 0.5 - MIDDLE) @ turn.T - 0.5 + MIDDLE).astype(np.int64)

@@ -85,7 +85,7 @@ def expected(shell: PointShell, pose: Array) -> NaiveTouch:
 
 
 @pytest.mark.long
-def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) -> None:
+def test_frames_users_law_database_equals_cells(env: Environment) -> None:
     shell = random_shell(300, 300, 8.0, SIZE)
     n_contacts = 0
     with CellTable.create(LEAST_BUDGET) as table:

@@ -64,7 +64,7 @@ def plate(xy: Array, u: float, thickness: float) -> tuple[Array, Array]:
     n_points=st.sampled_from([1, 4, 50]),
     seed=st.integers(0, 1000),
 )
-def test_a_plate_is_pushed_by_its_near_side_alone(
+def test_distance_law_plate_near_side_only(
     thickness: float, u: float, n_points: int, seed: int
 ) -> None:
     """F = K s (delta - u) a point, averaged over the near side."""
@@ -75,7 +75,7 @@ def test_a_plate_is_pushed_by_its_near_side_alone(
     assert felt[0] == felt[1] == 0.0
 
 
-def test_a_point_that_only_faces_away_is_no_contact_but_stays_a_hit() -> None:
+def test_distance_law_back_facing_point_no_contact() -> None:
     """The far side: a hit has depth 0, and what is no hit is not felt."""
     points = np.array([[30.2, 30.3, PLANE_AT + 0.8], [30.2, 30.3, PLANE_AT + 1.2]])
     shell = PointShell(np.array(ORIGIN) + SIZE * points, -UP.repeat(2, 0), np.zeros(3))
@@ -87,7 +87,7 @@ def test_a_point_that_only_faces_away_is_no_contact_but_stays_a_hit() -> None:
     assert pairs.tolist() == []
 
 
-def test_a_point_on_the_surface_keeps_its_force() -> None:
+def test_distance_law_point_on_surface() -> None:
     """The interpolant's gradient is 0 there; the slope ahead of the point is not."""
     for u in (0.5, 0.3, 0.2):
         felt = frame(sheet(), np.array([[30.2, 30.3, PLANE_AT + u]]), UP)
@@ -98,9 +98,7 @@ def test_a_point_on_the_surface_keeps_its_force() -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 5.0, 20.0, 45.0])
 @pytest.mark.parametrize(("side", "most"), [(3, 0.02), (10, 0.01), (17, 0.01)])
-def test_a_flat_tool_slides_over_a_plane_without_ripple(
-    degrees: float, side: int, most: float
-) -> None:
+def test_distance_law_sliding_plane_ripple(degrees: float, side: int, most: float) -> None:
     """std / mean of the normal force at constant depths; 9, 100 and 289 points."""
     scene, turn = tilted(degrees)
     across = np.arange(side) * (10.0 / (side - 1)) - 5.0
@@ -146,9 +144,7 @@ def steepest(scene: Merged, start: Array, end: Array, normal: Array) -> tuple[fl
 
 
 @pytest.mark.parametrize(("height", "askew"), [(0.55, 0.5), (0.8, 0.0), (1.1, 0.5)])
-def test_nothing_jumps_in_a_concave_corner_or_over_a_convex_edge(
-    height: float, askew: float
-) -> None:
+def test_distance_law_bounded_steps_at_corner_and_edge(height: float, askew: float) -> None:
     normal = np.array([askew, 0.0, 1.0]) / np.hypot(askew, 1.0)
     for scene, first, last in ((CORNER, 20.2, 22.7), (EDGE, 30.5, 34.8)):
         start = np.array([first, 30.3, 20.0 + height])

@@ -63,7 +63,7 @@ def listening() -> Iterator[socket.socket]:
             listening.accept()
 
 
-def test_a_recording_opens_nothing_but_a_file_beside_it(
+def test_recording_opens_only_file_beside_it(
     run: Run, scene: Path, tmp_path_factory: pytest.TempPathFactory, listening: socket.socket
 ) -> None:
     """For anything else the person is asked to name the environment."""
@@ -81,7 +81,7 @@ def test_a_recording_opens_nothing_but_a_file_beside_it(
     assert not [*scene.with_name("beside").iterdir()]
 
 
-def test_a_recording_opens_a_file_beside_it_wherever_the_person_is(
+def test_recording_relative_to_its_folder(
     run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with hapticdb.open(scene) as env:
@@ -96,7 +96,7 @@ def test_a_recording_opens_a_file_beside_it_wherever_the_person_is(
 @pytest.mark.parametrize(
     ("name", "text"), [("a.gltf", GLTF), ("a.dae", COLLADA), ("a.obj", WAVEFRONT), ("a.ply", PLY)]
 )
-def test_addresses_in_a_file_of_geometry_are_not_followed(
+def test_read_file_follows_no_address(
     tmp_path: Path, listening: socket.socket, name: str, text: str
 ) -> None:
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/more"

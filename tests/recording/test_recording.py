@@ -42,7 +42,7 @@ repeatedly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture
 
 @repeatedly
 @given(frames=arrays(FRAME, st.integers(1, 6)), n=st.integers(1, 6))
-def test_frames_return_bit_for_bit(tmp_path: Path, frames: Frames, n: int) -> None:
+def test_recorder_frames_round_trip_bits(tmp_path: Path, frames: Frames, n: int) -> None:
     """Also infinities, signed zeros and NaN."""
     path = tmp_path / "s.hdbrec"
     with begun(path, replace=True) as recorder:
@@ -52,7 +52,7 @@ def test_frames_return_bit_for_bit(tmp_path: Path, frames: Frames, n: int) -> No
     assert len(Recording(path)) == len(frames) == len(recorder)
 
 
-def test_the_header_returns(tmp_path: Path, sphere: PointShell) -> None:
+def test_recording_header_round_trip(tmp_path: Path, sphere: PointShell) -> None:
     head = header(
         sphere,
         law=DistanceField(800.0),
@@ -70,14 +70,14 @@ def test_the_header_returns(tmp_path: Path, sphere: PointShell) -> None:
         assert getattr(found.shell, name).tobytes() == getattr(sphere, name).tobytes()
 
 
-def test_a_session_without_frames_is_a_recording(tmp_path: Path) -> None:
+def test_recording_without_frames(tmp_path: Path) -> None:
     found = Recording(write(tmp_path / "s.hdbrec", motion(0)))
     assert (len(found), len(found.frames()), found.n_torn) == (0, 0, 0)
     times, poses = found.poses()
     assert (times.shape, poses.shape) == ((0,), (0, 4, 4))
 
 
-def test_poses_are_those_of_the_hand(tmp_path: Path) -> None:
+def test_recording_poses_of_hand(tmp_path: Path) -> None:
     frames = motion(500)
     times, poses = Recording(write(tmp_path / "s.hdbrec", frames)).poses()
     np.testing.assert_array_equal(times, frames["time"])
@@ -85,7 +85,7 @@ def test_poses_are_those_of_the_hand(tmp_path: Path) -> None:
     np.testing.assert_array_equal(poses[:, :3, :3], rotation_of(frames["hand"][:, 3:]))
 
 
-def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
+def test_recording_format_as_documented(tmp_path: Path) -> None:
     """The file is read as docs/format.md describes, with NumPy alone."""
     frames = motion(9)
     path = write(tmp_path / "s.hdbrec", frames)
@@ -110,7 +110,7 @@ def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
 # --- files that exist ---------------------------------------------------------------------------
 
 
-def test_a_file_is_not_replaced_unasked(tmp_path: Path) -> None:
+def test_recorder_existing_file_needs_replace(tmp_path: Path) -> None:
     path = tmp_path / "s.hdbrec"
     path.write_text("a letter")
     with pytest.raises(UsageError, match=r"is there already: replace it \(--replace\)"):
@@ -126,7 +126,7 @@ def test_a_file_is_not_replaced_unasked(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
-def test_a_recording_is_replaced_by_the_first_frames_of_another(tmp_path: Path) -> None:
+def test_recorder_replaces_at_first_frame(tmp_path: Path) -> None:
     path = write(tmp_path / "s.hdbrec", motion(10))
     before = path.read_bytes()
     with begun(path, replace=True):
@@ -141,7 +141,7 @@ def test_a_recording_is_replaced_by_the_first_frames_of_another(tmp_path: Path) 
     assert recorded(path).tobytes() == motion(4).tobytes()
 
 
-def test_no_password_is_written(tmp_path: Path) -> None:
+def test_recorder_writes_no_password(tmp_path: Path) -> None:
     url = "postgresql://ann:secret@127.0.0.1/plant?password=secret"
     path = write(tmp_path / "s.hdbrec", motion(1), header(environment=url))
     assert b"secret" not in path.read_bytes()
@@ -158,12 +158,12 @@ def test_no_password_is_written(tmp_path: Path) -> None:
         {"law": SimpleNamespace()},
     ],
 )
-def test_a_header_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
+def test_header_bad_values(changes: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         header(**changes)
 
 
-def test_what_is_no_recording_of_this_version_is_told(tmp_path: Path) -> None:
+def test_recording_other_file_or_version(tmp_path: Path) -> None:
     path = tmp_path / "s.hdbrec"
     with pytest.raises(FileError, match="no recording at"):
         Recording(path)
@@ -183,7 +183,7 @@ def test_what_is_no_recording_of_this_version_is_told(tmp_path: Path) -> None:
 # --- files that were cut off --------------------------------------------------------------------
 
 
-def test_a_file_cut_anywhere_is_read_up_to_its_last_whole_frame(tmp_path: Path) -> None:
+def test_recording_truncated_file(tmp_path: Path) -> None:
     content = write(tmp_path / "whole.hdbrec", motion(4)).read_bytes()
     start = len(content) - 4 * FRAME.itemsize
     path = tmp_path / "cut.hdbrec"
@@ -200,7 +200,7 @@ def test_a_file_cut_anywhere_is_read_up_to_its_last_whole_frame(tmp_path: Path) 
 
 @repeatedly
 @given(place=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
-def test_a_changed_header_is_refused_in_one_line(tmp_path: Path, place: float, flip: int) -> None:
+def test_recording_corrupt_header(tmp_path: Path, place: float, flip: int) -> None:
     content = bytearray(write(tmp_path / "s.hdbrec", motion(0)).read_bytes())
     content[int(place * len(content))] ^= flip
     (tmp_path / "s.hdbrec").unlink()
@@ -210,7 +210,7 @@ def test_a_changed_header_is_refused_in_one_line(tmp_path: Path, place: float, f
     assert "\n" not in str(raised.value)
 
 
-def test_a_killed_recorder_leaves_whole_frames(tmp_path: Path) -> None:
+def test_recorder_killed_leaves_whole_frames(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     for n in range(4):
         path = tmp_path / f"{n}.hdbrec"
@@ -234,7 +234,7 @@ def test_a_killed_recorder_leaves_whole_frames(tmp_path: Path) -> None:
 # --- limits -------------------------------------------------------------------------------------
 
 
-def test_a_full_disk_leaves_whole_frames(tmp_path: Path) -> None:
+def test_recorder_disk_full_leaves_whole_frames(tmp_path: Path) -> None:
     path = tmp_path / "s.hdbrec"
     child = os.fork()
     if child == 0:  # the file size limit holds for the child process only
@@ -256,7 +256,7 @@ def test_a_full_disk_leaves_whole_frames(tmp_path: Path) -> None:
     assert recorded(path).tobytes() == motion(len(found)).tobytes()
 
 
-def test_a_recording_ends_at_its_limit_and_leaves_room_on_its_disk(
+def test_recorder_size_limit_and_disk_reserve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     size = write(tmp_path / "whole.hdbrec", motion(500)).stat().st_size
@@ -279,14 +279,12 @@ def test_a_recording_ends_at_its_limit_and_leaves_room_on_its_disk(
 
 
 @pytest.mark.parametrize("limit", [0, -5, float("nan")])
-def test_a_limit_that_makes_no_sense_is_refused(tmp_path: Path, limit: Any) -> None:  # noqa: ANN401
+def test_recorder_bad_limit(tmp_path: Path, limit: Any) -> None:  # noqa: ANN401
     with pytest.raises(UsageError, match="bytes at most: give 1 or more"):
         Recorder(tmp_path / "s.hdbrec", limit_bytes=limit)
 
 
-def test_where_no_frame_would_fit_nothing_is_begun(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recorder_limit_below_one_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = Recorder(tmp_path / "s.hdbrec", limit_bytes=400)
     recorder.open()
     with pytest.raises(UsageError, match="400 bytes at most, and its header and a frame take"):
@@ -300,7 +298,7 @@ def test_where_no_frame_would_fit_nothing_is_begun(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_session_goes_on_without_its_recording(sphere: PointShell, tmp_path: Path) -> None:
+def test_session_continues_beyond_recording_limit(sphere: PointShell, tmp_path: Path) -> None:
     path = tmp_path / "short.hdbrec"
     with floored(make(tmp_path, bits=6)) as env, Session(
         env.url, sphere, still(0.010), law="plane", rate=RATE, seconds=2.0,

@@ -55,7 +55,7 @@ def in_parts(frames: ResidentFrames, poses: Poses, size: int) -> FrameResults:
 
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=4)
-def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_cluster_skipping_same_bits(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     """Slow and fast hands that turn and jump, small and large runs, one pose or many at once."""
     env = make(tmp_path_factory.mktemp("clusters"))
     scatter(env, n_objects=2, n_voxels=600, seed=seed)

@@ -63,7 +63,7 @@ def write(env: Environment) -> None:
     move(env.store, env.objects()[0].id, np.array([[1, 2, 3]]))
 
 
-def test_a_database_nearby_is_measured(env: Environment, measured: list[Store]) -> None:
+def test_costs_at_start_near_database_measured(env: Environment, measured: list[Store]) -> None:
     """One slow answer does not make it far."""
     line = Line(FAR / 2)
     assert costs_at_start(line.to(env), lambda: line.now) == MEASURED
@@ -73,9 +73,7 @@ def test_a_database_nearby_is_measured(env: Environment, measured: list[Store]) 
     assert len(measured) == 2
 
 
-def test_a_measurement_is_kept_until_the_environment_is_written(
-    env: Environment, measured: list[Store]
-) -> None:
+def test_costs_at_start_measured_once_per_revision(env: Environment, measured: list[Store]) -> None:
     far = Line(10.0)
     for n_measured in (1, 2):
         assert costs_at_start(env.store, time.monotonic) == MEASURED
@@ -84,16 +82,14 @@ def test_a_measurement_is_kept_until_the_environment_is_written(
         write(env)
 
 
-def test_kept_figures_are_taken_and_nothing_is_measured(
-    env: Environment, measured: list[Store]
-) -> None:
+def test_costs_at_start_stored(env: Environment, measured: list[Store]) -> None:
     env.store.save_costs(ELSEWHERE, MEASURED.figures())
     line = Line(1.0)
     assert costs_at_start(line.to(env), lambda: line.now) == MEASURED
     assert (measured, line.trips) == ([], 1)
 
 
-def test_a_start_over_a_slow_line_takes_a_few_round_trips(env: Environment) -> None:
+def test_costs_at_start_far_database_few_round_trips(env: Environment) -> None:
     """At 150 ms a round trip, the hundreds of round trips of a calibration took minutes."""
     line = Line(0.15)
     with CellTable.create(LEAST_BUDGET) as table:
@@ -102,7 +98,7 @@ def test_a_start_over_a_slow_line_takes_a_few_round_trips(env: Environment) -> N
 
 
 @pytest.mark.usefixtures("env")
-def test_an_empty_environment_is_not_measured(tmp_path: Path, measured: list[Store]) -> None:
+def test_costs_at_start_empty_environment(tmp_path: Path, measured: list[Store]) -> None:
     (tmp_path / "empty").mkdir()
     with make(tmp_path / "empty") as empty, CellTable.create(LEAST_BUDGET) as table:
         Residency(empty.store, table)

@@ -76,7 +76,7 @@ def check(residency: Residency, objects: dict[int, Points]) -> int:
     ("bits", "curve", "at_once"),
     [(3, "z", 7), (4, "hilbert", 7), (5, "z", 7), (6, "z", source.ROWS_AT_ONCE), (6, "hilbert", 7)],
 )
-def test_cells_hold_the_least_distances_of_all_objects(
+def test_residency_least_distances_of_objects(
     tmp_path: Path, bits: int, curve: CurveName, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without the excluded ones, and however many rows are unpacked together."""
@@ -93,7 +93,7 @@ def test_cells_hold_the_least_distances_of_all_objects(
             assert (check(residency, kept) > 0) == bool(kept)
 
 
-def test_distances_follow_what_another_user_moves(tmp_path: Path, table: CellTable) -> None:
+def test_residency_distances_follow_moves(tmp_path: Path, table: CellTable) -> None:
     """A voxel moves within its cell, next to a border: the cell beside is read again, too."""
     env = make(tmp_path, 6)
     objects = clumps(env)
@@ -119,7 +119,7 @@ def test_distances_follow_what_another_user_moves(tmp_path: Path, table: CellTab
     check(residency, objects)
 
 
-def test_evicted_cells_come_back_with_their_distances(tmp_path: Path) -> None:
+def test_residency_distances_after_eviction(tmp_path: Path) -> None:
     env = make(tmp_path)
     objects = clumps(env, 5)
     cells = cells_of(env.grid)
@@ -134,7 +134,7 @@ def test_evicted_cells_come_back_with_their_distances(tmp_path: Path) -> None:
         assert residency.writer.n_evicted > 0
 
 
-def test_an_object_without_distances_is_refused(tmp_path: Path, table: CellTable) -> None:
+def test_residency_object_without_distances(tmp_path: Path, table: CellTable) -> None:
     """At the start, and when another user writes it; a table without distances takes it."""
     env = make(tmp_path)
     clumps(env, 1)
@@ -151,7 +151,7 @@ def test_an_object_without_distances_is_refused(tmp_path: Path, table: CellTable
         Residency(env.store, other).make_resident(cells_of(env.grid))
 
 
-def test_damaged_distances_are_told_so(
+def test_residency_damaged_distances(
     tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = make(tmp_path)
@@ -172,9 +172,7 @@ def test_damaged_distances_are_told_so(
 
 
 @pytest.mark.parametrize("curve", ["z", "hilbert"])
-def test_objects_near_a_voxel_are_those_whose_own_distance_is_small(
-    tmp_path: Path, curve: CurveName
-) -> None:
+def test_ids_near_voxels_equal_brute_force(tmp_path: Path, curve: CurveName) -> None:
     env = make(tmp_path, 6, "brick", curve)
     rng = np.random.default_rng(3)
     objects = {}

@@ -24,7 +24,7 @@ from voxels import write_voxels
 
 @pytest.mark.parametrize("bits", [3, 6])
 @pytest.mark.parametrize(("layout", "curve"), HIERARCHICAL)
-def test_frames_are_the_oracles_bit_for_bit(
+def test_resident_frames_equal_oracle_bits(
     tmp_path: Path, layout: Layout, curve: CurveName, bits: int
 ) -> None:
     """In each layout and curve, inside and outside the grid, with an object left out, clustered."""
@@ -55,7 +55,7 @@ def test_frames_are_the_oracles_bit_for_bit(
             ).tobytes()
 
 
-def test_a_tool_that_needs_more_cells_than_the_table_has_is_refused(tmp_path: Path) -> None:
+def test_resident_frames_tool_beyond_table(tmp_path: Path) -> None:
     env = make(tmp_path, bits=8)
     voxels = np.random.default_rng(0).integers(0, 256, (60_000, 3))
     write_voxels(env.store, np.unique(voxels, axis=0))
@@ -66,7 +66,7 @@ def test_a_tool_that_needs_more_cells_than_the_table_has_is_refused(tmp_path: Pa
             larger.evaluate(np.eye(4))
 
 
-def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Path) -> None:
+def test_resident_frames_margin_beyond_table(tmp_path: Path) -> None:
     """Small clusters far apart: each lies in one cell, and with a margin touches up to eight."""
     env = make(tmp_path, bits=9)
     size = env.grid.voxel_size
@@ -101,9 +101,7 @@ def scene(env: Environment) -> dict[int, Wrenches]:
 
 
 @pytest.mark.parametrize("curve", ["z", "hilbert"])
-def test_both_laws_feel_the_same_in_memory_as_in_the_database(
-    tmp_path: Path, curve: CurveName
-) -> None:
+def test_resident_frames_equal_database_frames(tmp_path: Path, curve: CurveName) -> None:
     """With an object left out, flat and in clusters, and after another user's move."""
     env = make(tmp_path, 7, "brick", curve)
     objects = scene(env)
@@ -131,7 +129,7 @@ def test_both_laws_feel_the_same_in_memory_as_in_the_database(
                 residency.refresh()
 
 
-def test_a_law_that_reads_distances_demands_cells_that_have_them(tmp_path: Path) -> None:
+def test_resident_frames_distance_law_needs_distances(tmp_path: Path) -> None:
     env = make(tmp_path)
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)

@@ -87,7 +87,7 @@ STEPS = st.lists(
 
 @given(STEPS)
 @settings(deadline=None, max_examples=6)
-def test_what_is_resident_is_what_the_database_holds(
+def test_residency_random_steps_equal_database(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
 ) -> None:
     """After loads and evictions in any order, writes of others, and new writers."""
@@ -118,7 +118,7 @@ def test_what_is_resident_is_what_the_database_holds(
     env.close()
 
 
-def test_cells_follow_the_words_of_a_filter(tmp_path: Path, table: CellTable) -> None:
+def test_residency_follows_filter_words(tmp_path: Path, table: CellTable) -> None:
     """What others add is in the cells if the words choose it then."""
 
     def named(name: str, number: int, material: str) -> int:
@@ -164,7 +164,7 @@ def full_of_voxels(folder: Path, bits: int = 8) -> Environment:
     return env
 
 
-def test_what_is_wanted_stays_and_the_rest_makes_way(tmp_path: Path, table: CellTable) -> None:
+def test_residency_evicts_unwanted_cells_only(tmp_path: Path, table: CellTable) -> None:
     env = full_of_voxels(tmp_path)
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
@@ -182,9 +182,7 @@ def test_what_is_wanted_stays_and_the_rest_makes_way(tmp_path: Path, table: Cell
     check(residency, voxels_by_cell(env))
 
 
-def test_a_tool_too_large_for_the_table_keeps_the_cells_that_it_has(
-    tmp_path: Path, table: CellTable
-) -> None:
+def test_residency_tool_larger_than_table(tmp_path: Path, table: CellTable) -> None:
     """Also with a new writer, which reads as many again as there is room for."""
     env = full_of_voxels(tmp_path)
     residency = Residency(env.store, table)
@@ -206,9 +204,7 @@ def test_a_tool_too_large_for_the_table_keeps_the_cells_that_it_has(
     assert (residency.slots_of(urgent[:n_read]) > 0).all()
 
 
-def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
-    tmp_path: Path, table: CellTable
-) -> None:
+def test_residency_empty_cells_bounded(tmp_path: Path, table: CellTable) -> None:
     env = make(tmp_path, bits=9)  # 4096 cells, all without voxels
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
@@ -222,7 +218,7 @@ def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
     assert check(residency, {}) > 200
 
 
-def test_a_write_during_a_load_is_caught_up_with(tmp_path: Path, table: CellTable) -> None:
+def test_residency_write_during_load(tmp_path: Path, table: CellTable) -> None:
     """One version has both: the new cells, and the known cells read again."""
     env = make(tmp_path)
     scatter(env)
@@ -236,7 +232,7 @@ def test_a_write_during_a_load_is_caught_up_with(tmp_path: Path, table: CellTabl
     assert check(residency, voxels_by_cell(env)) == 60
 
 
-def test_only_the_most_urgent_cells_are_read_again_and_the_others_forgotten(
+def test_residency_refresh_most_urgent_cells(
     tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "MOST_RENEWED", 10)
@@ -252,7 +248,7 @@ def test_only_the_most_urgent_cells_are_read_again_and_the_others_forgotten(
 
 
 @pytest.mark.parametrize("few", [0, 1 << 14])
-def test_writes_elsewhere_leave_cells_as_they_are(
+def test_residency_writes_elsewhere_leave_cells(
     tmp_path: Path, table: CellTable, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For both ways in which the cells of a write are found."""
@@ -270,9 +266,7 @@ def test_writes_elsewhere_leave_cells_as_they_are(
     check(residency, voxels_by_cell(env))
 
 
-def test_a_server_that_lost_its_last_commits_makes_all_unknown(
-    tmp_path: Path, table: CellTable
-) -> None:
+def test_residency_server_lost_commits(tmp_path: Path, table: CellTable) -> None:
     env = full_of_voxels(tmp_path, bits=7)
     residency = Residency(env.store, table)
     residency.load(residency.missing(cells_of(env.grid)))
@@ -283,7 +277,7 @@ def test_a_server_that_lost_its_last_commits_makes_all_unknown(
     assert (residency.writer.n_resident, residency.writer.n_empty) == (0, 0)
 
 
-def test_slots_of_a_load_that_failed_are_used_again(
+def test_residency_slots_of_failed_load_reused(
     tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     env = full_of_voxels(tmp_path, bits=7)
@@ -305,9 +299,7 @@ def test_slots_of_a_load_that_failed_are_used_again(
     check(residency, voxels_by_cell(env))
 
 
-def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
-    tmp_path: Path, table: CellTable
-) -> None:
+def test_residency_cells_of_dead_writer_reread(tmp_path: Path, table: CellTable) -> None:
     """The environment may since have been replaced by another with as many writes."""
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
@@ -326,7 +318,7 @@ def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
     assert (residency.slots_of(urgent) != UNKNOWN).all()
 
 
-def test_an_order_without_cells_is_refused(tmp_path: Path, table: CellTable) -> None:
+def test_residency_lexicographic_order_refused(tmp_path: Path, table: CellTable) -> None:
     env = make(tmp_path, layout="voxel", curve="lexicographic")
     with pytest.raises(
         UsageError, match="lexicographic order, which has no cells: 'hapticdb copy'"
@@ -334,9 +326,7 @@ def test_an_order_without_cells_is_refused(tmp_path: Path, table: CellTable) -> 
         Residency(env.store, table)
 
 
-def test_a_reader_that_died_in_a_frame_holds_the_writer_up_for_a_moment_only(
-    tmp_path: Path, table: CellTable
-) -> None:
+def test_residency_dead_reader_does_not_block_writer(tmp_path: Path, table: CellTable) -> None:
     env = full_of_voxels(tmp_path)
     residency = Residency(env.store, table)
     row = table.join()
@@ -362,7 +352,7 @@ def shell_of(places: NDArray[np.int64], env: Environment) -> PointShell:
     )
 
 
-def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) -> None:
+def test_residency_no_torn_cell_or_mixed_revision(tmp_path: Path) -> None:
     """Frames run in a thread while the object moves and the writer loads, evicts and refreshes."""
     env = make(tmp_path, bits=8)
     pattern = np.array([[5, 5, 5], [6, 6, 6], [20, 9, 31], [31, 31, 0]])

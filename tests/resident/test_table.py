@@ -21,7 +21,7 @@ from hapticdb.resident.table import LEAST_BUDGET, MOST_READERS, CellTable, is_al
 
 @given(st.integers(LEAST_BUDGET, 16 << 20), st.booleans())
 @settings(deadline=None, max_examples=10)
-def test_the_budget_is_used_and_never_exceeded(budget: int, distances: bool) -> None:
+def test_cell_table_within_budget(budget: int, distances: bool) -> None:
     with CellTable.create(LEAST_BUDGET, distances=distances) as small:
         a_cell = small.size_bytes / small.n_slots
     with CellTable.create(budget, distances=distances) as table:
@@ -36,12 +36,12 @@ def test_the_budget_is_used_and_never_exceeded(budget: int, distances: bool) -> 
         assert ends[-1][1] - ends[0][0] <= table.size_bytes
 
 
-def test_a_budget_beyond_the_machines_memory_is_refused() -> None:
+def test_cell_table_budget_beyond_memory() -> None:
     with pytest.raises(UsageError, match=r"^a budget of \d+ bytes .*: this machine has \d+$"):
         CellTable.create(1 << 50)
 
 
-def test_a_limit_of_file_size_is_named_where_it_limits_memory() -> None:
+def test_cell_table_file_size_limit() -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, before[1]))
     try:
@@ -51,7 +51,7 @@ def test_a_limit_of_file_size_is_named_where_it_limits_memory() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:
+def test_cell_table_reader_rows() -> None:
     with CellTable.create(LEAST_BUDGET) as table:
         rows: list[int] = []
         threads = [
@@ -70,7 +70,7 @@ def test_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:
         assert table.queue.pids[7] == 0
 
 
-def test_a_row_says_nothing_of_who_had_it_before() -> None:
+def test_cell_table_row_cleared_for_next_reader() -> None:
     """Nothing is left even if the former reader ended in the middle of a write."""
     with CellTable.create(LEAST_BUDGET) as table:
         row = table.join()
@@ -84,7 +84,7 @@ def test_a_row_says_nothing_of_who_had_it_before() -> None:
         assert sessions[row] == np.zeros((), sessions.dtype)
 
 
-def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
+def test_cell_table_dead_reader_releases_lease() -> None:
     """Also for a zombie, whose parent has not waited; living readers keep what they hold."""
     with child([sys.executable, "-c", "pass"]) as gone, CellTable.create(LEAST_BUDGET) as table:
         until(lambda: not is_alive(gone.pid))  # the process is a zombie
@@ -102,7 +102,7 @@ def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
     assert is_alive(1)
 
 
-def test_a_zombie_that_is_waited_for_at_that_moment_does_not_run(
+def test_is_alive_zombie_reaped_meanwhile(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with child([sys.executable, "-c", "pass"]) as gone:
@@ -117,7 +117,7 @@ def test_a_zombie_that_is_waited_for_at_that_moment_does_not_run(
             assert not is_alive(gone.pid)
 
 
-def test_a_table_is_not_copied() -> None:
+def test_cell_table_not_copyable() -> None:
     """A copy in the same process would share its descriptor, and close it twice."""
     with CellTable.create(LEAST_BUDGET) as table:
         for made in (copy.copy, copy.deepcopy):

@@ -34,7 +34,7 @@ def cookie_header(known: Access, token: str) -> dict[str, str]:
     return {"cookie": f"other=1; {known.cookie_name}={known.sign_in(token)}"}
 
 
-def test_each_token_gives_its_role_by_header_and_by_cookie() -> None:
+def test_access_role_by_header_and_cookie() -> None:
     known = of_two_roles(Clock())
     for token, role in ((VIEWER, Role.VIEWER), (EDITOR, Role.EDITOR)):
         assert known.role_of_headers({"authorization": f"Bearer {token}"}) is role
@@ -52,11 +52,11 @@ def test_each_token_gives_its_role_by_header_and_by_cookie() -> None:
         {"cookie": "\x00;;=;\udcff"},
     ],
 )
-def test_whoever_shows_nothing_that_is_known_has_no_role(headers: dict[str, str]) -> None:
+def test_access_unknown_credentials_no_role(headers: dict[str, str]) -> None:
     assert of_two_roles(Clock()).role_of_headers(headers) is None
 
 
-def test_attempts_are_counted_for_each_address() -> None:
+def test_sign_in_rate_limit_per_address() -> None:
     """An IPv6 address stands for its network of 64 bits."""
     limits = replace(Limits(), sign_ins_per_second=1e-9, sign_ins_at_once=1.0)
     door = SignIn(of_two_roles(Clock()), cast("ClientPage", None), limits, "", "title")
@@ -69,13 +69,13 @@ def test_attempts_are_counted_for_each_address() -> None:
     assert [status(address) for address in tries] == [403, 429, 403, 403, 429, 403]
 
 
-def test_a_wrong_token_has_no_role_where_no_token_has_one() -> None:
+def test_access_wrong_token_with_open_role() -> None:
     known = Access({EDITOR: Role.EDITOR}, open_role=Role.VIEWER)
     assert known.role_of_headers({}) is Role.VIEWER
     assert known.role_of_headers({"authorization": f"Bearer {VIEWER}"}) is None
 
 
-def test_a_cookie_lives_while_it_is_used_and_ends_an_hour_later() -> None:
+def test_access_cookie_expires_after_disuse() -> None:
     clock = Clock()
     known = of_two_roles(clock)
     header = cookie_header(known, VIEWER)
@@ -86,7 +86,7 @@ def test_a_cookie_lives_while_it_is_used_and_ends_an_hour_later() -> None:
     assert known.role_of_headers(header) is None
 
 
-def test_the_cookie_used_longest_ago_makes_room() -> None:
+def test_access_least_recently_used_cookie_evicted() -> None:
     clock = Clock()
     known = of_two_roles(clock)
     first, second = cookie_header(known, VIEWER), cookie_header(known, EDITOR)
@@ -101,12 +101,12 @@ def test_the_cookie_used_longest_ago_makes_room() -> None:
 @pytest.mark.parametrize(
     "token", ["", "short", "x" * 257, "with a blank inside it", "ümläute-sind-keine-ziffern"]
 )
-def test_a_token_that_can_be_guessed_or_needs_escapes_is_refused(token: str) -> None:
+def test_access_weak_token_refused(token: str) -> None:
     with pytest.raises(UsageError, match="token"):
         Access({token: Role.VIEWER})
 
 
-def test_roles_are_ordered_and_found_by_their_words() -> None:
+def test_role_order_and_words() -> None:
     assert [Role.of(role.word) for role in sorted(Role)] == [Role.VIEWER, Role.TOUCHER, Role.EDITOR]
     with pytest.raises(UsageError, match="viewer, toucher, editor"):
         Role.of("owner")

@@ -57,7 +57,7 @@ def page() -> Iterator[Page]:
         yield browser.new_page(viewport={"width": 640, "height": 400})
 
 
-def test_the_view_opens_by_its_link_and_works_under_the_policy(server: Running, page: Page) -> None:
+def test_view_chromium_content_security_policy(server: Running, page: Page) -> None:
     complaints: list[str] = []
 
     def hear(message: ConsoleMessage) -> None:
@@ -85,9 +85,7 @@ def test_the_view_opens_by_its_link_and_works_under_the_policy(server: Running, 
     assert complaints != []
 
 
-def test_the_page_says_that_it_connects_and_that_the_server_has_ended(
-    environment: Path, page: Page
-) -> None:
+def test_view_chromium_connection_overlay(environment: Path, page: Page) -> None:
     page.add_init_script(WATCHING)
     with running(Serving(urls(environment), tokens=TOKENS, page="viser_page:work")) as server:
         page.goto(f"{server.address}?token={next(iter(TOKENS))}", timeout=LONG)
@@ -97,7 +95,7 @@ def test_the_page_says_that_it_connects_and_that_the_server_has_ended(
     until(lambda: "server has ended" in page.evaluate("cover()"), "its end is told", page)
 
 
-def test_a_person_signs_in_by_the_form(server: Running, page: Page) -> None:
+def test_view_chromium_sign_in_form(server: Running, page: Page) -> None:
     page.goto(server.address, timeout=LONG)
     page.get_by_label("Token").fill("not-the-right-token")
     page.get_by_role("button").click()

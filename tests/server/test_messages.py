@@ -32,20 +32,20 @@ CLICK = {
 
 
 @pytest.mark.parametrize("message", [CAMERA, GIZMO, CLICK])
-def test_what_viser_sends_passes_with_the_same_content(message: dict[str, object]) -> None:
+def test_validated_viser_messages_unchanged(message: dict[str, object]) -> None:
     passed = validated(encode(message), Role.EDITOR).passed
     assert passed is not None
     assert message.items() <= msgspec.msgpack.decode(passed).items()
 
 
 @pytest.mark.parametrize("kind", get_args(Known))
-def test_each_type_is_a_message_of_viser(kind: type[msgspec.Struct]) -> None:
+def test_known_messages_exist_in_viser(kind: type[msgspec.Struct]) -> None:
     theirs = getattr(viser_messages, kind.__name__)
     assert set(kind.__struct_fields__) <= {field.name for field in fields(theirs)}
 
 
 @pytest.mark.parametrize("content", [True, 0.5, "word", [1, 2.5], ["a", "b"], None])
-def test_values_of_widgets_pass(content: object) -> None:
+def test_validated_widget_values(content: object) -> None:
     message = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": content}}
     passed = validated(encode(message), Role.VIEWER).passed
     assert passed is not None
@@ -55,7 +55,7 @@ def test_values_of_widgets_pass(content: object) -> None:
 @pytest.mark.parametrize(
     "type_", ["ShareUrlRequest", "FileTransferStartUpload", "RunJavascriptMessage", "no such type"]
 )
-def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
+def test_validated_unknown_types(type_: str) -> None:
     for more in ({}, {"uuid": "a"}, {"name": "/tool", "updates": {"visible": False}}):
         assert validated(encode({"type": type_} | more), Role.EDITOR) == Verdict(None, "type")
 
@@ -77,7 +77,7 @@ def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
         {"value": b"bytes"},
     ],
 )
-def test_no_other_attribute_and_no_wild_value_passes(updates: dict[str, object]) -> None:
+def test_validated_other_attributes_and_values(updates: dict[str, object]) -> None:
     message = {"type": "GuiUpdateMessage", "uuid": "a", "updates": updates}
     assert validated(encode(message), Role.EDITOR) == Verdict(None, "malformed")
 
@@ -97,26 +97,26 @@ def test_no_other_attribute_and_no_wild_value_passes(updates: dict[str, object])
         CLICK | {"event_type": "rect-select", "screen_pos": [[0, 0], [1, 1]]},
     ],
 )
-def test_a_gizmo_or_a_click_with_wrong_fields_does_not_pass(message: dict[str, object]) -> None:
+def test_validated_gizmo_and_click_fields(message: dict[str, object]) -> None:
     assert validated(encode(message), Role.EDITOR) == Verdict(None, "malformed")
 
 
-def test_a_viewer_moves_no_gizmo_and_a_toucher_does() -> None:
+def test_validated_gizmo_by_role() -> None:
     assert validated(encode(GIZMO), Role.VIEWER) == Verdict(None, "role")
     assert validated(encode(GIZMO), Role.TOUCHER).passed is not None
 
 
-def test_no_message_is_large() -> None:
+def test_validated_size_limit() -> None:
     assert validated(b"\x91" * (LARGEST + 1), Role.EDITOR) == Verdict(None, "size")
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_judged_without_an_error(message: bytes) -> None:
+def test_validated_arbitrary_bytes(message: bytes) -> None:
     assert validated(message, Role.EDITOR).passed is None or msgspec.msgpack.decode(message)
 
 
 @given(st.data())
-def test_damaged_messages_are_judged_without_an_error(data: st.DataObject) -> None:
+def test_validated_damaged_messages(data: st.DataObject) -> None:
     message = bytearray(encode(data.draw(st.sampled_from([CAMERA, GIZMO]))))
     for _ in range(3):
         message[data.draw(st.integers(0, len(message) - 1))] = data.draw(st.integers(0, 255))

@@ -52,7 +52,7 @@ def status(place: tuple[str, int]) -> int:
         return connection.getresponse().status
 
 
-def test_idle_connections_leave_room_for_requests() -> None:
+def test_server_idle_connections_leave_room() -> None:
     """More than the server takes at once; some have sent a part of a request."""
     limits = Limits(connections=32, silent=8, request_seconds=TIMEOUT)
 
@@ -68,7 +68,7 @@ def test_idle_connections_leave_room_for_requests() -> None:
     asyncio.run(work())
 
 
-def test_a_request_that_is_answered_is_not_cut_by_idle_connections() -> None:
+def test_server_slow_answer_survives_idle_connections() -> None:
     limits = Limits(silent=2, request_seconds=TIMEOUT)
 
     async def work() -> None:
@@ -93,7 +93,7 @@ def test_a_request_that_is_answered_is_not_cut_by_idle_connections() -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "rebound.example"])
-def test_a_refused_websocket_logs_no_error(host: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_server_refused_websocket_not_logged(host: str, caplog: pytest.LogCaptureFixture) -> None:
     async def close(scope: Scope, receive: Receive, send: Send) -> None:
         await WebSocket(scope, receive, send).close(1008)
 

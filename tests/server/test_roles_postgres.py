@@ -55,9 +55,7 @@ def take_the_wheel_out(person: PagePerson) -> None:
 
 
 @pytest.mark.long
-def test_what_reads_as_a_viewer_cannot_write_whatever_is_sent(
-    urls: dict[Role, str], admin: psycopg.Connection
-) -> None:
+def test_server_viewer_login_cannot_write(urls: dict[Role, str], admin: psycopg.Connection) -> None:
     """Whoever has stolen even the editor's token: the database refuses."""
     url = urls[Role.VIEWER]
     before = stored(admin, url)
@@ -75,9 +73,7 @@ def test_what_reads_as_a_viewer_cannot_write_whatever_is_sent(
 
 
 @pytest.mark.long
-def test_only_an_editors_browser_reaches_the_address_that_may_write(
-    urls: dict[Role, str], admin: psycopg.Connection
-) -> None:
+def test_server_role_selects_database_url(urls: dict[Role, str], admin: psycopg.Connection) -> None:
     """The same steps change nothing for a viewer and a toucher, and do for an editor."""
     url = urls[Role.VIEWER]
     before = stored(admin, url)
@@ -96,9 +92,7 @@ def test_only_an_editors_browser_reaches_the_address_that_may_write(
         assert [obj.name for obj in env.objects()] == ["door"]
 
 
-def test_a_viewers_search_for_clashes_keeps_nothing_and_an_editor_accepts(
-    urls: dict[Role, str], tmp_path: Path
-) -> None:
+def test_server_clashes_viewer_reads_editor_accepts(urls: dict[Role, str], tmp_path: Path) -> None:
     file = row_of_boxes(tmp_path / "row.db", 2, 0.099).with_suffix(".glb")
     with hapticdb.open(urls[Role.EDITOR]) as env:
         for obj in env.objects():

@@ -34,14 +34,14 @@ def server(environment: Path) -> Iterator[Running]:
         yield found
 
 
-def test_without_a_token_there_is_only_the_form(server: Running) -> None:
+def test_server_without_token_form_only(server: Running) -> None:
     answer, body = server.ask("/")
     assert (answer.status, b"viser" in body.lower()) == (401, False)
     with pytest.raises(InvalidStatus):
         server.browser()
 
 
-def test_a_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(server: Running) -> None:
+def test_server_token_to_http_only_cookie(server: Running) -> None:
     answer, body = server.ask(f"/?token={EDITOR}")
     assert answer.status == 200
     assert EDITOR.encode() not in body
@@ -55,7 +55,7 @@ def test_a_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(server
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
-def test_a_rebound_name_is_refused(server: Running, host: str) -> None:
+def test_server_rebound_host_refused(server: Running, host: str) -> None:
     answer, _ = server.ask("/healthz", Host=host)
     assert answer.status in {400, 403}
     with pytest.raises(InvalidStatus):
@@ -63,14 +63,14 @@ def test_a_rebound_name_is_refused(server: Running, host: str) -> None:
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
-def test_another_site_opens_no_socket_and_sends_no_form(server: Running, origin: str) -> None:
+def test_server_cross_origin_refused(server: Running, origin: str) -> None:
     with pytest.raises(InvalidStatus):
         server.browser(Role.EDITOR, Origin=origin)
     answer, _ = server.ask("/", "POST", f"token={EDITOR}".encode(), Origin=origin)
     assert (answer.status, answer.getheader("set-cookie")) == (403, None)
 
 
-def test_a_socket_without_an_origin_is_a_programs_and_needs_a_token(server: Running) -> None:
+def test_server_socket_without_origin_needs_token(server: Running) -> None:
     """Browsers send the header with every WebSocket."""
     with server.browser(Role.EDITOR, Origin="") as program:
         sent(program, CAMERA)
@@ -79,7 +79,7 @@ def test_a_socket_without_an_origin_is_a_programs_and_needs_a_token(server: Runn
         server.browser(None, Origin="")
 
 
-def test_a_form_needs_an_origin_and_a_small_body(server: Running) -> None:
+def test_server_form_origin_and_size(server: Running) -> None:
     assert server.ask("/", "POST", b"token=x")[0].status == 403
     own = f"http://{server.place}"
     assert server.ask("/", "POST", b"x" * 5000, Origin=own)[0].status == 413
@@ -87,7 +87,7 @@ def test_a_form_needs_an_origin_and_a_small_body(server: Running) -> None:
     assert (answer.status, answer.getheader("location")) == (303, "/")
 
 
-def test_a_link_shows_parts_by_their_ids_and_is_kept_by_a_sign_in(server: Running) -> None:
+def test_server_link_to_objects_after_sign_in(server: Running) -> None:
     _, body = server.ask(f"/see/1,2?token={EDITOR}&initialCameraNear=3")
     assert b'url=/see/1,2?initialCameraNear=3"' in body
     shown = {"Authorization": f"Bearer {EDITOR}"}
@@ -98,7 +98,7 @@ def test_a_link_shows_parts_by_their_ids_and_is_kept_by_a_sign_in(server: Runnin
         browser_at(f"{server.place}/see/1,x", **shown)
 
 
-def test_every_answer_has_the_headers_that_restrain_browsers(server: Running) -> None:
+def test_server_security_headers(server: Running) -> None:
     for path in ("/", "/healthz", "/no/such/path", f"/?token={EDITOR}"):
         answer, body = server.ask(path)
         policy = str(answer.getheader("content-security-policy"))
@@ -110,7 +110,7 @@ def test_every_answer_has_the_headers_that_restrain_browsers(server: Running) ->
         assert str(Path.cwd()).encode() not in body
 
 
-def test_figures_need_a_token_or_this_machine(server: Running) -> None:
+def test_server_metrics_access(server: Running) -> None:
     assert b"hapticdb_sessions" in server.ask("/metrics")[1]
     far = "203.0.113.7"
     assert server.ask("/metrics", X_Forwarded_For=far)[0].status == 403
@@ -118,7 +118,7 @@ def test_figures_need_a_token_or_this_machine(server: Running) -> None:
     assert server.ask("/metrics", X_Forwarded_For=far, Authorization=shown)[0].status == 200
 
 
-def test_malformed_and_unknown_messages_reach_nobody(server: Running) -> None:
+def test_server_malformed_messages_dropped(server: Running) -> None:
     with server.browser(Role.EDITOR) as healthy, server.browser(Role.EDITOR) as bad:
         for browser in (healthy, bad):
             sent(browser, CAMERA)
@@ -137,7 +137,7 @@ def is_counted(server: Running, figure: str) -> bool:
     return f"hapticdb_{figure}\n" in server.ask("/metrics")[1].decode()
 
 
-def test_a_flood_is_slowed_down_and_then_closed(environment: Path) -> None:
+def test_server_flood_throttled_then_closed(environment: Path) -> None:
     limits = replace(Limits(), messages_per_second=100.0, messages_at_once=10.0,
                      throttled_seconds=0.5)  # fmt: skip
     serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
@@ -149,9 +149,7 @@ def test_a_flood_is_slowed_down_and_then_closed(environment: Path) -> None:
         until(lambda: is_counted(server, 'browser_connections_total{end="flood"} 1.0'))
 
 
-def test_a_page_that_was_killed_is_started_again_when_the_machine_has_room(
-    environment: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_server_killed_page_restarts(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No process is to be had for a moment; nothing stays open of the tries, browsers come back."""
     serving = Serving(urls(environment), tokens=TOKENS, prefix="/hapticdb", page="viser_page:work")
     tries: list[int] = []
@@ -191,7 +189,7 @@ def _is_back(server: Running) -> bool:
         return False
 
 
-def test_what_is_silent_or_asks_twice_is_cut(environment: Path) -> None:
+def test_server_silent_and_pipelined_requests_cut(environment: Path) -> None:
     """No request, half of one, a form that does not come, and a second request."""
     limits = replace(Limits(), request_seconds=0.2)
     serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
@@ -219,7 +217,7 @@ def _all_read(server: Running, said: str) -> bytes:
     return b""
 
 
-def test_an_old_cookie_keeps_no_browser_out_where_everybody_may_enter(environment: Path) -> None:
+def test_server_stale_cookie_with_open_role(environment: Path) -> None:
     serving = Serving(urls(environment), open_role=Role.TOUCHER, page="viser_page:work")
     with running(serving) as server:
         cookie = f"hapticdb-{server.port}=of-an-earlier-run"
@@ -229,7 +227,7 @@ def test_an_old_cookie_keeps_no_browser_out_where_everybody_may_enter(environmen
             text_until(browser, "clock")
 
 
-def test_a_cookie_that_runs_out_ends_its_browsers_connection(
+def test_server_expired_cookie_closes_connection(
     server: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(relay, "RENEW_EVERY", -1.0)
@@ -243,14 +241,14 @@ def test_a_cookie_that_runs_out_ends_its_browsers_connection(
         assert close_code(browser) == 4401
 
 
-def test_a_page_that_cannot_start_ends_the_server_with_its_error(environment: Path) -> None:
+def test_server_page_start_error(environment: Path) -> None:
     serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:fail")
     with pytest.raises(hapticdb.errors.HapticDBError, match="no such scene"), running(serving):
         pass
 
 
 @pytest.mark.parametrize("host", ["::", "192.0.2.1", "example.org", "10.0.0.1"])
-def test_another_address_needs_a_token(host: str) -> None:
+def test_check_serving_public_address_needs_token(host: str) -> None:
     serving = Serving(urls("car.db"), open_role=Role.EDITOR, host=host)
     with pytest.raises(UsageError, match="--token"):
         check(serving)

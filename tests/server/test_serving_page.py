@@ -6,7 +6,7 @@ from hapticdb.server.limits import Limits
 from sources import ROOT
 
 
-def test_the_unit_waits_longer_than_the_server_needs_to_stop_and_nothing_runs_as_root() -> None:
+def test_deploy_unit_stop_timeout_and_user() -> None:
     unit = (ROOT / "deploy" / "hapticdb.service").read_text()
     waits = re.search(r"^TimeoutStopSec=(\d+)", unit, re.MULTILINE)
     assert waits is not None

@@ -22,7 +22,7 @@ TOKEN = "a-token-for-toucher"  # noqa: S105
 SHOWN = {"Authorization": f"Bearer {TOKEN}"}
 
 
-def test_a_browser_uses_the_page_over_tls(environment: Path, tmp_path: Path) -> None:
+def test_server_page_over_tls(environment: Path, tmp_path: Path) -> None:
     certificate, key = str(tmp_path / "cert.pem"), str(tmp_path / "key.pem")
     command = [
         "openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
@@ -53,7 +53,7 @@ def test_a_browser_uses_the_page_over_tls(environment: Path, tmp_path: Path) -> 
         assert len(asyncio.run(first_frame(secure.place))) > 16
 
 
-def test_small_messages_leave_at_once_and_uncompressed(
+def test_server_small_messages_undelayed_uncompressed(
     environment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """TCP_NODELAY at the server's end; no extension, even if asked for."""

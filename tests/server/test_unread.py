@@ -51,7 +51,7 @@ async def until(claim: Callable[[], object]) -> None:
         await asyncio.sleep(0.01)
 
 
-def test_sending_to_a_client_that_answers_no_ping_ends() -> None:
+def test_send_to_client_without_pong_ends() -> None:
     ended: list[bool] = []
 
     async def send_for_ever(_scope: Scope, _receive: Receive, send: Send) -> None:
@@ -69,7 +69,7 @@ def test_sending_to_a_client_that_answers_no_ping_ends() -> None:
     asyncio.run(work())
 
 
-def test_a_client_that_does_not_read_the_last_message_is_cut(
+def test_close_unread_last_message_cut(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     is_served: list[bool] = []
@@ -106,7 +106,7 @@ def unwilling() -> Any:  # noqa: ANN401 - in place of a WebSocket
     return made
 
 
-def test_a_browser_that_takes_no_close_frame_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relay_client_without_close_frame_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(relay, "CLOSING_TIMEOUT", 0.01)
     figures = Metrics()
     served = Relay(Access({}), cast("PageSupervisor", None), Limits(), figures)

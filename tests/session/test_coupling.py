@@ -13,7 +13,7 @@ from hapticdb.session.coupling import Coupling
 OMNI = PROFILES["omni"]
 
 
-def test_the_numbers_are_the_device_s_unless_they_are_given() -> None:
+def test_coupling_settled_from_profile_or_given() -> None:
     found = Coupling().settled(OMNI, 10_000.0, 1.0, 0.1)
     assert (found.profile, found.stiffness, found.cap) == ("omni", 700.0, 3.3)
     # K (T / 2 + t_d), with a delay of one period
@@ -28,7 +28,7 @@ def test_the_numbers_are_the_device_s_unless_they_are_given() -> None:
     assert (given.torque_cap, given.damping, given.delay) == (0.1, 1.0, 1e-4)
 
 
-def test_a_profile_that_is_given_takes_the_place_of_the_device_s() -> None:
+def test_coupling_given_profile_wins() -> None:
     found = Coupling(profile=PROFILES["delta"]).settled(OMNI, 20_000.0, 1.0, 0.1)
     assert (found.profile, found.cap) == ("delta", 20.0)
     known = DeviceProfile("mine", 5.0, 600.0, 2.0, torque_cap=0.3, turn_stiffness=4.0)
@@ -36,7 +36,7 @@ def test_a_profile_that_is_given_takes_the_place_of_the_device_s() -> None:
     assert (found.torque_cap, found.turn_stiffness) == (0.3, 4.0)
 
 
-def test_the_stiffness_is_lowered_to_what_stays_stable_and_the_line_says_so() -> None:
+def test_coupling_stiffness_lowered_to_stable() -> None:
     found = Coupling(stiffness=650.0).settled(OMNI, 1000.0, 1.0, 0.1)
     allowed = limit_stiffness(OMNI, 1000.0, 650.0)
     assert found.stiffness == allowed.stiffness < 650.0
@@ -45,7 +45,7 @@ def test_the_stiffness_is_lowered_to_what_stays_stable_and_the_line_says_so() ->
     assert found.turn_stiffness == pytest.approx(found.stiffness * 0.1**2)
 
 
-def test_a_damper_is_no_stronger_than_the_device_renders() -> None:
+def test_coupling_damping_of_device_limit() -> None:
     slow = Coupling(stiffness=1000.0).settled(
         replace(SCRIPTED, damping=5.0, delay=0.1), 100.0, 1.0, 0.1
     )
@@ -53,7 +53,7 @@ def test_a_damper_is_no_stronger_than_the_device_renders() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.01, 100.0])
-def test_stiffness_caps_and_damping_are_the_device_s_at_every_scale(scale: float) -> None:
+def test_coupling_scale_invariant(scale: float) -> None:
     """The tool is S times as large in the scene, so its lever at the device is the same."""
     at_one = asdict(Coupling().settled(OMNI, 5000.0, 1.0, 0.1))
     found = asdict(Coupling().settled(OMNI, 5000.0, scale, 0.1 * scale))
@@ -69,13 +69,13 @@ def test_stiffness_caps_and_damping_are_the_device_s_at_every_scale(scale: float
         ("delay", math.inf, "delay of inf s: give 0 or more"),
     ],
 )
-def test_what_makes_no_sense_is_refused(name: str, value: float, message: str) -> None:
+def test_coupling_bad_values(name: str, value: float, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         Coupling(**{name: value})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("scale", [0.1, 10.0])
-def test_without_a_spring_the_caps_are_the_device_s_at_every_scale(scale: float) -> None:
+def test_coupling_direct_caps_scale_invariant(scale: float) -> None:
     found = Coupling().direct(OMNI, scale, 0.1 * scale)
     assert (found.profile, found.cap) == ("omni", 3.3)
     assert found.torque_cap == pytest.approx(0.33)

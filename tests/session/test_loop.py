@@ -81,7 +81,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
         yield ran
 
 
-def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
+def test_loop_ends_with_device_zero_force(run: Run) -> None:
     applied: list[Floats] = []
     hand = Player([0.0, 0.2], [at(0.0, 0.0, 0.010)] * 2)
     hand.apply = applied.append  # type: ignore[assignment]
@@ -94,7 +94,7 @@ def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
     assert not applied[-1].any()
 
 
-def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
+def test_loop_slow_hand_misses_deadlines(run: Run) -> None:
     answer, _, frames = run(Slow(still(0.03), every=10, seconds=0.011), seconds=0.5, rate=250.0)
     loop = answer.loop
     assert loop.missed >= len(frames) // 10
@@ -106,14 +106,14 @@ def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
 
 
 @pytest.mark.long
-def test_a_users_law_is_felt_and_may_raise(run: Run) -> None:
+def test_loop_users_law(run: Run) -> None:
     frames = run(still(0.010), law=Penalty(), seconds=0.2, has_baseline=False).frames
     assert frames["applied"][-1, 2] > 0.0
     with pytest.raises(ValueError, match="this law is off"):
         run(still(0.010), law=Penalty(is_on=False), seconds=0.1, has_baseline=False)
 
 
-def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> None:
+def test_loop_first_clutch_compiles_nothing(run: Run) -> None:
     hand = Clutched(stroking(0.010, 0.5))
     _, _, frames = run(hand, handle=Handle(clutch=0), seconds=60.0)
     is_open = frames["state"] & State.CLUTCH_OPEN > 0
@@ -123,7 +123,7 @@ def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> No
     assert not frames["hand_velocity"][is_open].any()
 
 
-def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
+def test_loop_failed_hand_zero_force(run: Run) -> None:
     applied: list[Floats] = []
     hand = Unplugged(still(0.010), 100)
     hand.apply = applied.append  # type: ignore[assignment]
@@ -133,22 +133,20 @@ def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
     assert not applied[-1].any()
 
 
-def test_a_hand_that_does_not_know_its_place_at_once_is_asked_again(run: Run) -> None:
+def test_loop_waits_for_first_valid_pose(run: Run) -> None:
     answer, counts, frames = run(Lost(still(0.010), 20, 0.0))
     assert np.isfinite(frames["tool"]).all()
     assert counts["hit_frames"] == len(frames)
     assert answer.is_warm
 
 
-def test_a_hand_that_never_knows_its_place_is_an_error(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_loop_no_valid_pose(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subject, "WARM_TIMEOUT", 0.05)
     with pytest.raises(DeviceError, match=r"has not said where it is within 0.05 s.*calibration$"):
         run(Lost(still(0.010), 1 << 30, 0.0))
 
 
-def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: Run) -> None:
+def test_loop_invalid_readings_force_fades(run: Run) -> None:
     nowhere = np.full(6, np.nan)
     hand = Odd(still(0.010), lambda r: r._replace(velocity=nowhere), first=60, n_reads=50)
     hand.over_after = 250
@@ -161,12 +159,12 @@ def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: R
     assert (forces == 0.0).any()
 
 
-def test_a_start_without_cells_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loop_cold_start(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subject, "WARM_TIMEOUT", 0.0)
     assert not run(still(0.03)).answer.is_warm
 
 
-def test_a_database_that_is_silent_for_too_long_makes_frames_hold(run: Run) -> None:
+def test_loop_stale_database_holds(run: Run) -> None:
     _, counts, frames = run(still(0.010), staleness=-60.0)
     assert counts["stale_frames"] == counts["held_frames"] == len(frames)
     assert not frames["applied"][frames["time"] > 0.1].any()

@@ -104,7 +104,7 @@ def requested(world: World, hand: Pressing, seconds: float = 1.0) -> WorkerReque
     return WorkerRequest(shared, Timing(200.0), law, rendering_of(None, law), alone)
 
 
-def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
+def test_loop_withdraws_object_request(world: World) -> None:
     """A whole run: a hand leaves the floor while the database keeps answering."""
 
     class Leaving(Pressing):
@@ -126,7 +126,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
     assert not world.table.queue.requests["n_asked"].any()
 
 
-def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
+def test_loop_held_first_frame_without_hits(world: World) -> None:
     hand = Pressing(-0.004)
     request = requested(world, hand)
     shared = request.shared
@@ -156,7 +156,7 @@ def _end(number: int, _: object) -> None:
     raise Ended
 
 
-def test_a_loop_told_to_end_while_it_runs_lets_its_device_go(world: World) -> None:
+def test_loop_sigterm_releases_device(world: World) -> None:
     class Told(Pressing):
         def apply(self, wrench: Floats) -> None:
             super().apply(wrench)
@@ -171,7 +171,7 @@ def test_a_loop_told_to_end_while_it_runs_lets_its_device_go(world: World) -> No
     assert not hand.sent[-1].any()
 
 
-def test_a_loop_told_to_end_while_its_device_hangs_lets_it_go(world: World) -> None:
+def test_loop_sigterm_hanging_device_released(world: World) -> None:
     class Hanging(Pressing):
         def read(self) -> Reading:
             if len(self.sent) == 20:
@@ -188,9 +188,7 @@ def test_a_loop_told_to_end_while_its_device_hangs_lets_it_go(world: World) -> N
 
 
 @pytest.mark.parametrize("when", ["apply", "close"])
-def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
-    world: World, when: str
-) -> None:
+def test_loop_sigterm_during_device_close(world: World, when: str) -> None:
     class Told(Pressing):
         is_failing = is_closed = False
 

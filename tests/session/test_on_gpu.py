@@ -34,7 +34,7 @@ def simulated() -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("check", CHECKS)
-def test_the_simulator_moves_the_tool_as_the_processor(simulated: str, check: str) -> None:
+def test_gpu_queries_simulator_equals_cpu(simulated: str, check: str) -> None:
     assert check in simulated.splitlines(), simulated
 
 
@@ -45,14 +45,12 @@ def test_the_simulator_moves_the_tool_as_the_processor(simulated: str, check: st
         ({"frames_on": "cuda", "law": "plane"}, "rendering coupled"),
     ],
 )
-def test_what_a_gpu_cannot_do_is_refused_before_anything_is_opened(
-    choices: dict[str, object], told: str
-) -> None:
+def test_session_gpu_unsupported_options(choices: dict[str, object], told: str) -> None:
     with pytest.raises(UsageError, match=told):
         Session("none.db", PointShell.sphere(0.01, 10), still(0.03), **choices)  # type: ignore[arg-type]
 
 
-def test_no_gpu_is_told_before_anything_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_session_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     with pytest.raises(MissingExtraError, match=r"no GPU.*pip install .*numba-cuda"):
         Session("none.db", PointShell.sphere(0.01, 10), still(0.03), frames_on="cuda")

@@ -75,7 +75,7 @@ def env(
 
 
 @pytest.mark.parametrize(("law", "rendering"), SESSIONS)
-def test_what_the_device_received_is_recorded_and_replays_bit_for_bit(
+def test_replay_same_bits_as_device_received(
     env: Environment, sphere: PointShell, tmp_path: Path, law: LawName, rendering: Rendering
 ) -> None:
     hand = NotedClutched(sliding(0.004), tmp_path / "received")
@@ -115,7 +115,7 @@ def rewritten(path: Path, frames: Frames, header: Header | None = None) -> Path:
 
 
 @pytest.mark.parametrize("field", ["tool", "applied", "contacts", "hand"])
-def test_a_changed_bit_is_named_by_its_frame(
+def test_replay_changed_bit_named_by_frame(
     distance_floor: Environment, session: Path, field: str
 ) -> None:
     frames = recorded(session)
@@ -127,9 +127,7 @@ def test_a_changed_bit_is_named_by_its_frame(
     assert found.describe().startswith(f"parts at frame {n} ({found.time:.3f} s), for no known")
 
 
-def test_lost_frames_another_build_and_a_gpu_are_named_as_reasons(
-    distance_floor: Environment, session: Path
-) -> None:
+def test_replay_reasons_lost_frames_build_gpu(distance_floor: Environment, session: Path) -> None:
     frames, header = recorded(session), Recording(session).header
     n = int(np.flatnonzero(frames["contacts"])[40])
     found = parting(rewritten(session, np.delete(frames, np.s_[n - 20 : n])), distance_floor)
@@ -145,7 +143,7 @@ def test_lost_frames_another_build_and_a_gpu_are_named_as_reasons(
         assert words in found.reason
 
 
-def test_an_edit_is_named_where_it_is_felt_alone(tmp_path: Path, sphere: PointShell) -> None:
+def test_replay_edit_named_only_in_reach(tmp_path: Path, sphere: PointShell) -> None:
     with make(tmp_path, bits=6) as env:
         write_points(env.store, floor_points(31.5), "floor")
         write_points(env.store, np.array([[2.0, 2.0, 2.0]]), "aside")
@@ -159,9 +157,7 @@ def test_an_edit_is_named_where_it_is_felt_alone(tmp_path: Path, sphere: PointSh
     assert first.reason.startswith("since the environment was edited: revision 2 then, 4 now")
 
 
-def test_unknown_cells_are_named_and_all_before_them_is_equal(
-    tmp_path: Path, sphere: PointShell
-) -> None:
+def test_replay_unknown_cells_named(tmp_path: Path, sphere: PointShell) -> None:
     """A hand that leaps over the floor meets cells that nobody has fetched yet."""
     far = [at(x, 0.0, z) for x, z in ((-0.4, 0.03), (-0.4, 0.01), (0.4, 0.01), (0.4, 0.03))]
     hand = Player([0.0, 0.3, 0.301, 0.7], far)
@@ -174,7 +170,7 @@ def test_unknown_cells_are_named_and_all_before_them_is_equal(
     assert found.reason == f"since frame {n} met cells not in memory"
 
 
-def test_a_large_tool_a_filter_and_a_new_coupling_replay_bit_for_bit(
+def test_replay_large_tool_filter_coupling_same_bits(
     distance_floor: Environment, tmp_path: Path
 ) -> None:
     coupling = Coupling(stiffness=700.0, cap=2.0)
@@ -196,7 +192,7 @@ def test_a_large_tool_a_filter_and_a_new_coupling_replay_bit_for_bit(
     assert found.is_equal, found.describe()
 
 
-def test_another_grid_is_refused_and_nothing_is_not_equal(
+def test_replay_other_grid_and_empty_recording(
     tmp_path: Path, distance_floor: Environment, session: Path
 ) -> None:
     with make(tmp_path, bits=7) as other, pytest.raises(GridError, match="was recorded on"):

@@ -83,19 +83,19 @@ def play(cells: ResidentCells, shell: PointShell, path: Path, law: LawName) -> P
 # -- sessions without disturbance --------------------------------------------------------------
 
 
-def test_a_session_ends_with_its_device(by_law: Played) -> None:
+def test_session_ends_with_device(by_law: Played) -> None:
     loop = by_law.report.loop
     assert 0.9 <= loop.seconds <= 1.1 + loop.lateness.worst  # its last frame may be late
     assert not is_alive(by_law.loop_pid)
 
 
-def test_every_deadline_was_kept_or_missed(by_law: Played) -> None:
+def test_session_frames_and_misses_equal_deadlines(by_law: Played) -> None:
     loop = by_law.report.loop
     assert loop.frames + loop.missed == pytest.approx(RATE * loop.seconds, abs=2.0)
     assert loop.rate <= RATE * 1.01
 
 
-def test_the_recording_has_every_frame(by_law: Played) -> None:
+def test_session_recording_has_every_frame(by_law: Played) -> None:
     report, frames = by_law.report, by_law.frames
     assert len(frames) == report.loop.frames == report.recorded_frames
     assert report.lost_records == 0
@@ -103,7 +103,7 @@ def test_the_recording_has_every_frame(by_law: Played) -> None:
     assert (np.diff(frames["time"]) > 0.0).all()
 
 
-def test_the_figures_are_those_of_the_frames(played: Played) -> None:
+def test_session_report_equals_frames(played: Played) -> None:
     report, frames = played.report, played.frames
     assert report.hit_frames == np.count_nonzero(frames["hits"]) > 0
     assert report.contact_frames == np.count_nonzero(frames["contacts"])
@@ -119,7 +119,7 @@ def test_the_figures_are_those_of_the_frames(played: Played) -> None:
     assert not frames["applied"][is_free].any()
 
 
-def test_the_report_is_finite_json(by_law: Played) -> None:
+def test_session_report_finite_json(by_law: Played) -> None:
     found = json.loads(json.dumps(plain(by_law.report), allow_nan=False))
     assert found["loop"]["frames"] == by_law.report.loop.frames
     assert found["loop"]["lateness"]["p99"] == by_law.report.loop.lateness.p99
@@ -131,9 +131,7 @@ def test_the_report_is_finite_json(by_law: Played) -> None:
 # -- sessions with disturbances ----------------------------------------------------------------
 
 
-def test_a_session_is_waited_for_in_steps_and_stopped(
-    cells: ResidentCells, sphere: PointShell
-) -> None:
+def test_session_wait_in_steps_and_stop(cells: ResidentCells, sphere: PointShell) -> None:
     with Session(
         cells, sphere, still(0.010), law="plane", rate=RATE, staleness=NEVER_STALE
     ) as session:
@@ -153,7 +151,7 @@ def test_a_session_is_waited_for_in_steps_and_stopped(
 @pytest.mark.parametrize(
     "how", [signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.long)]
 )
-def test_a_loop_that_is_killed_is_one_clear_error(
+def test_session_killed_loop_one_error(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path, how: int
 ) -> None:
     path = tmp_path / "cut.hdbrec"
@@ -172,7 +170,7 @@ def test_a_loop_that_is_killed_is_one_clear_error(
     assert report.hit_frames == report.loop.frames
 
 
-def test_a_session_that_is_closed_without_waiting_has_recorded_all(
+def test_session_close_without_wait_records_all(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "unwatched.hdbrec"
@@ -186,7 +184,7 @@ def test_a_session_that_is_closed_without_waiting_has_recorded_all(
     ("kind", "message"),
     [(DeviceError, r"^the hand was unplugged"), (ValueError, r"ended: ValueError: the hand was")],
 )
-def test_a_hand_that_fails_ends_the_session_with_its_error(
+def test_session_failing_hand_raises_its_error(
     cells: ResidentCells, sphere: PointShell, kind: type[Exception], message: str
 ) -> None:
     hand = Unplugged(still(0.010), 200, kind)
@@ -197,7 +195,7 @@ def test_a_hand_that_fails_ends_the_session_with_its_error(
     assert not is_alive(pid)
 
 
-def test_a_session_that_does_not_begin_leaves_no_recording(
+def test_session_failed_start_leaves_no_recording(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "never.hdbrec"
@@ -214,7 +212,7 @@ def test_a_session_that_does_not_begin_leaves_no_recording(
 
 
 @pytest.mark.parametrize("step", ["open", "begin"])
-def test_a_session_ended_while_its_recording_is_made_leaves_none(
+def test_session_terminated_start_leaves_no_recording(
     cells: ResidentCells,
     sphere: PointShell,
     tmp_path: Path,
@@ -250,7 +248,7 @@ def test_a_session_ended_while_its_recording_is_made_leaves_none(
         ({"staleness": 0.0}, "a staleness of 0.0 s"),
     ],
 )
-def test_what_makes_no_sense_is_refused(
+def test_session_bad_options(
     cells: ResidentCells, sphere: PointShell, options: dict[str, object], message: str
 ) -> None:
     with pytest.raises(UsageError, match=re.escape(message)):
@@ -261,9 +259,7 @@ def test_what_makes_no_sense_is_refused(
 
 
 @pytest.mark.long
-def test_a_users_law_with_an_array_behind_a_short_number_is_felt(
-    cells: ResidentCells, sphere: PointShell
-) -> None:
+def test_session_users_law_with_array_field(cells: ResidentCells, sphere: PointShell) -> None:
     """A wrong address would end the session's process."""
     with Session(
         cells, sphere, still(0.010), law=users_law.Table(), rendering="direct", rate=RATE,
@@ -274,7 +270,7 @@ def test_a_users_law_with_an_array_behind_a_short_number_is_felt(
     assert report.contact_frames == report.loop.frames > 0
 
 
-def test_numbers_of_a_law_lie_as_a_compiler_lays_them() -> None:
+def test_layout_of_equals_compiler() -> None:
     layout = _layout_of(typeof(users_law.Table.for_kernels))
     assert [layout.fields[name][1] for name in layout.names] == [0, 8, 16]
     assert layout.itemsize == 72

@@ -19,7 +19,7 @@ from hapticdb.session.timing import SWITCH_INTERVAL, Timing, undisturbed
 GET_TIMERSLACK = 30
 
 
-def test_percentiles_are_of_all_that_was_counted() -> None:
+def test_spread_of_percentiles_beyond_bins() -> None:
     counts = np.zeros(TIME_BINS + 1, np.int64)
     assert spread_of(counts, 0.0) == (0.0, 0.0, 0.0, 0.0)
     counts[1:1001] = 1
@@ -31,7 +31,7 @@ def test_percentiles_are_of_all_that_was_counted() -> None:
 
 
 @pytest.mark.parametrize("law", [PLANE, DISTANCE])
-def test_an_empty_loop_lasts_as_many_deadlines_as_asked(law: ForceLaw) -> None:
+def test_empty_loop_duration(law: ForceLaw) -> None:
     figures = empty_loop(law, None, 500.0, 0.1)
     assert 50 <= figures.frames + figures.missed < 60 + figures.missed
     assert figures.seconds >= 0.1
@@ -52,7 +52,7 @@ def settings() -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize("kind", [None, ValueError, KeyboardInterrupt])
-def test_all_is_as_before_afterwards(kind: type[BaseException] | None) -> None:
+def test_undisturbed_restores_settings(kind: type[BaseException] | None) -> None:
     processor = min(os.sched_getaffinity(0))
     before = settings()
     try:
@@ -69,7 +69,7 @@ def test_all_is_as_before_afterwards(kind: type[BaseException] | None) -> None:
     assert settings() == before
 
 
-def test_a_processor_that_is_not_granted_is_refused_and_the_others_are_named(
+def test_timing_processor_not_available(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {7, 2, 3})

@@ -50,7 +50,7 @@ def copy(path: Path, tmp_path: Path) -> Path:
     return tmp_path / "copy.db"
 
 
-def test_a_copy_has_what_was_committed_and_nothing_beside_it(path: Path, tmp_path: Path) -> None:
+def test_backup_equals_source_without_log(path: Path, tmp_path: Path) -> None:
     with closing(SQLiteStore.open(path)) as store:
         write(store, 2)  # goes into the log
         report = backup_environment(path, tmp_path / "copy.db")
@@ -61,9 +61,7 @@ def test_a_copy_has_what_was_committed_and_nothing_beside_it(path: Path, tmp_pat
     assert names(tmp_path / "copy.db") == ["floor", "blob 1", "blob 2"]
 
 
-def test_a_copy_beside_a_writer_in_another_process_is_a_revision_of_it(
-    path: Path, tmp_path: Path
-) -> None:
+def test_backup_beside_writer_is_one_revision(path: Path, tmp_path: Path) -> None:
     script = (
         "import sys\n"
         "from hapticdb.store.sqlite.sqlite_store import SQLiteStore\n"
@@ -86,7 +84,7 @@ def test_a_copy_beside_a_writer_in_another_process_is_a_revision_of_it(
         assert len(found) > n + 2
 
 
-def test_a_file_that_is_there_is_replaced_only_when_that_is_said(copy: Path, path: Path) -> None:
+def test_backup_replace_existing_file(copy: Path, path: Path) -> None:
     before = files(copy.parent)
     with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="exists already"):
         backup_environment(path, copy)
@@ -97,7 +95,7 @@ def test_a_file_that_is_there_is_replaced_only_when_that_is_said(copy: Path, pat
     assert copy.stat().st_mode & 0o777 == 0o640
 
 
-def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
+def test_backup_damaged_page(path: Path, tmp_path: Path) -> None:
     with closing(SQLiteStore.open(path, read_only=True)) as store:
         ((end,),) = store._connection.fetch("SELECT max(pageno) FROM dbstat WHERE name = 'brick'")
     content = bytearray(path.read_bytes())
@@ -108,7 +106,7 @@ def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
     assert sorted(files(tmp_path)) == ["q.db"]
 
 
-def test_a_copy_takes_the_place_of_a_file_and_its_log(path: Path, copy: Path) -> None:
+def test_backup_restore_replaces_file_and_log(path: Path, copy: Path) -> None:
     killed(path, 3, 4)
     assert Path(f"{path}-wal").stat().st_size
     kept = copy.read_bytes()
@@ -120,7 +118,7 @@ def test_a_copy_takes_the_place_of_a_file_and_its_log(path: Path, copy: Path) ->
 
 
 @pytest.mark.parametrize("what", ["nothing", "a log", "damaged"])
-def test_a_copy_goes_where_the_file_is_gone_or_damaged(path: Path, copy: Path, what: str) -> None:
+def test_backup_restore_over_missing_or_damaged_file(path: Path, copy: Path, what: str) -> None:
     if what == "damaged":
         path.write_bytes(path.read_bytes()[:8192] + bytes(8192))
     else:
@@ -133,7 +131,7 @@ def test_a_copy_goes_where_the_file_is_gone_or_damaged(path: Path, copy: Path, w
 
 
 @pytest.mark.parametrize("read_only", [False, True])
-def test_a_file_that_is_open_is_not_replaced(path: Path, copy: Path, read_only: bool) -> None:
+def test_backup_replace_open_file_refused(path: Path, copy: Path, read_only: bool) -> None:
     script = (
         "import sys, hapticdb\n"
         "env = hapticdb.open(sys.argv[1], read_only=sys.argv[2] == 'True')\n"
@@ -175,7 +173,7 @@ def make_folder(path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [write_text, write_database, make_folder])
-def test_what_is_no_environment_is_neither_replaced_nor_copied(
+def test_backup_not_an_environment(
     copy: Path, tmp_path: Path, make: Callable[[Path], None]
 ) -> None:
     other = tmp_path / "other"
@@ -189,7 +187,7 @@ def test_what_is_no_environment_is_neither_replaced_nor_copied(
 
 
 @pytest.mark.usefixtures("path")
-def test_a_copy_without_room_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+def test_backup_disk_full_names_target(tmp_path: Path) -> None:
     program = (
         "import resource, hapticdb\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (40000, 40000))\n"
@@ -202,7 +200,7 @@ def test_a_copy_without_room_names_the_file_that_was_asked_for(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("step", ["sync_folder", "replace"])
-def test_a_replacement_that_is_killed_leaves_the_former_file_or_the_copy(
+def test_backup_replace_killed_is_atomic(
     path: Path, copy: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     """The log of the former file never lies beside the copy, to which SQLite would apply it."""
@@ -223,7 +221,7 @@ def test_a_replacement_that_is_killed_leaves_the_former_file_or_the_copy(
     assert names(path) == ["floor", "blob 1"]
 
 
-def test_the_verbs_say_what_they_have_copied(run: Run, path: Path) -> None:
+def test_backup_verb_output(run: Run, path: Path) -> None:
     out = succeeded(run("backup", path, "copy.db"))
     assert out.startswith(f"copy.db: {path} at revision 2, 2 objects, 0.")
     out = succeeded(run("backup", "copy.db", path, "--replace", "--json"))
@@ -237,7 +235,7 @@ def test_the_verbs_say_what_they_have_copied(run: Run, path: Path) -> None:
     }
 
 
-def test_bad_places_are_one_line(run: Run, path: Path, tmp_path: Path) -> None:
+def test_backup_bad_paths(run: Run, path: Path, tmp_path: Path) -> None:
     before = files(tmp_path)
     refused(run("backup", path, path), "itself")
     refused(run("backup", path, tmp_path / "no" / "copy.db"), "does not exist")

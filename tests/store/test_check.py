@@ -59,7 +59,7 @@ def used(path: Path, sphere: PointShell) -> None:
 
 
 @pytest.mark.parametrize(("layout", "name"), CASES)
-def test_a_crafted_environment_is_told_in_one_line_and_found_by_check(
+def test_check_environment_finds_crafted_rows(
     tmp_path: Path, sphere: PointShell, layout: Layout, name: str
 ) -> None:
     path = made(tmp_path / "e.db", layout)
@@ -72,7 +72,7 @@ def test_a_crafted_environment_is_told_in_one_line_and_found_by_check(
 
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 @pytest.mark.parametrize("bits", [1, 6])
-def test_a_sound_environment_stays_sound_through_edits(
+def test_check_environment_sound_after_edits(
     tmp_path: Path, layout: Layout, curve: hapticdb.grid.CurveName, bits: int
 ) -> None:
     grid = Grid(0.01, (-0.1, 0.2, 0.0), bits, curve)
@@ -89,7 +89,7 @@ def test_a_sound_environment_stays_sound_through_edits(
         assert report.objects == 3
 
 
-def test_check_speaks_by_its_exit_code(tmp_path: Path, run: Run) -> None:
+def test_check_exit_code(tmp_path: Path, run: Run) -> None:
     path = made(tmp_path / "sound.db", "brick")
     code, out, _ = run("check", path)
     assert (code, out.count("\n")) == (0, 1)
@@ -107,7 +107,7 @@ def test_check_speaks_by_its_exit_code(tmp_path: Path, run: Run) -> None:
     assert run("check", tmp_path / "none.db")[0] == 2
 
 
-def test_damage_that_a_fetching_process_reads_is_one_line(tmp_path: Path) -> None:
+def test_resident_cells_damaged_page_one_line(tmp_path: Path) -> None:
     path = made(tmp_path / "e.db", "brick")
     with closing(apsw.Connection(str(path))) as connection:
         connection.execute("DELETE FROM cost")  # so that it measures, which reads

@@ -99,7 +99,7 @@ def alter(url: str, name: str) -> None:
 
 
 @on_engines(list(ALTERED))
-def test_an_altered_column_is_found(
+def test_check_environment_altered_column(
     tmp_path: Path, row: Path, engine: Binaries | None, name: str
 ) -> None:
     with altered(engine, tmp_path, row, name) as url:
@@ -109,7 +109,7 @@ def test_an_altered_column_is_found(
 
 
 @on_engines(["bounds", *OF_PAIRS])
-def test_repair_mends_what_can_be_made_anew(
+def test_repair_environment_derived_columns(
     tmp_path: Path, row: Path, engine: Binaries | None, name: str
 ) -> None:
     """Pairs, by the next search; the accepted pair stays accepted where its row is there."""
@@ -124,7 +124,7 @@ def test_repair_mends_what_can_be_made_anew(
             assert [one.because for one in found.pairs if one.a == 1] == ["meant so"]
 
 
-def test_moved_and_removed_objects_leave_a_sound_environment(tmp_path: Path) -> None:
+def test_check_environment_sound_after_move_and_remove(tmp_path: Path) -> None:
     path = row_of_boxes(tmp_path / "row.db", 4, 0.099)
     searched(path)
     with hapticdb.open(path) as env:

@@ -97,7 +97,7 @@ class Proxy:
 
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["forwarded", "not forwarded", "late"])
-def test_a_write_whose_commit_is_not_answered_counts_once(
+def test_commit_unanswered_counts_once(
     server: Server, file: Path, edited: list[Contents], how: str
 ) -> None:
     proxy = Proxy(server, server.folder.parent)
@@ -121,7 +121,7 @@ def test_a_write_whose_commit_is_not_answered_counts_once(
     proxy.close()
 
 
-def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
+def test_commit_other_write_of_same_revision(
     server: Server, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Our write is lost at its COMMIT; before we reconnect, another writer moves the object."""
@@ -144,7 +144,7 @@ def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
     proxy.close()
 
 
-def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
+def test_write_hanging_server_ends_and_repeats(
     server: Server, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server and its children are stopped: the connection stays, and nothing answers."""
@@ -168,7 +168,7 @@ def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
 
 
 @pytest.mark.parametrize("is_killed", [False, True], ids=["hung", "ended"])
-def test_a_prompt_watch_reports_a_lost_server_and_does_not_wait(
+def test_watch_prompt_reports_lost_server(
     server: Server, url: str, file: Path, *, is_killed: bool
 ) -> None:
     with small(url, file) as env, hapticdb.open(env.url, read_only=True) as reading:
@@ -203,7 +203,7 @@ def cut_off(admin: psycopg.Connection) -> Callable[[Environment], None]:
 CutOff = Callable[[Environment], None]
 
 
-def test_a_connection_that_ends_between_frames_is_made_anew(
+def test_reconnect_between_frames(
     place: Place, file: Path, sphere: PointShell, cut_off: CutOff
 ) -> None:
     with small(place(), file) as env:
@@ -222,7 +222,7 @@ def test_a_connection_that_ends_between_frames_is_made_anew(
 
 
 @pytest.mark.parametrize("strategy", ["points", "statement"])
-def test_a_connection_that_ends_inside_a_frame_costs_nothing_but_time(
+def test_reconnect_inside_frame(
     place: Place,
     file: Path,
     sphere: PointShell,
@@ -238,9 +238,7 @@ def test_a_connection_that_ends_inside_a_frame_costs_nothing_but_time(
                 assert felt(env, sphere, np.eye(4), strategy) == expected
 
 
-def test_a_snapshot_does_not_go_on_over_another_connection(
-    place: Place, file: Path, cut_off: CutOff
-) -> None:
+def test_snapshot_lost_connection_ends_it(place: Place, file: Path, cut_off: CutOff) -> None:
     """Reads before the loss were on the lost connection, perhaps at another revision."""
     with small(place(), file) as env:
         with env.store.snapshot():
@@ -256,7 +254,7 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
         assert len(found) == len(env.objects()) == N_PARTS
 
 
-def test_an_interrupted_touch_leaves_nothing_behind(
+def test_touch_interrupted_leaves_no_backend(
     place: Place, file: Path, tmp_path: Path, admin: psycopg.Connection
 ) -> None:
     where = place()

@@ -46,9 +46,7 @@ def url(place: Place) -> str:
     return where
 
 
-def test_a_foreign_schema_is_told_apart_and_left_alone(
-    place: Place, admin: psycopg.Connection
-) -> None:
+def test_open_foreign_schema_untouched(place: Place, admin: psycopg.Connection) -> None:
     where = place()
     name = parse(where).environment
     admin.execute(f"CREATE SCHEMA {name} CREATE TABLE theirs (a int)")
@@ -59,7 +57,7 @@ def test_a_foreign_schema_is_told_apart_and_left_alone(
     assert admin.execute(f"SELECT count(*) FROM {name}.theirs").fetchone() == (0,)
 
 
-def test_another_format_is_refused_in_one_line(url: str, admin: psycopg.Connection) -> None:
+def test_open_other_format(url: str, admin: psycopg.Connection) -> None:
     name = parse(url).environment
     admin.execute(f"CREATE TABLE {name}.band (z_val bigint)")
     with pytest.raises(hapticdb.errors.NotAnEnvironmentError, match=r"made before 0\.1; import"):
@@ -74,15 +72,13 @@ def test_another_format_is_refused_in_one_line(url: str, admin: psycopg.Connecti
         hapticdb.open(url)
 
 
-def test_a_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:
+def test_lookup_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:
     admin.execute(f"DROP TABLE {parse(url).environment}.brick")
     with pytest.raises(hapticdb.errors.DamagedError, match="is damaged"):
         hapticdb.open(url, read_only=True).store.lookup(np.arange(9))
 
 
-def test_an_index_that_was_left_out_is_made_by_who_writes_and_rows_are_sorted_until_then(
-    url: str, admin: psycopg.Connection
-) -> None:
+def test_open_recreates_missing_index(url: str, admin: psycopg.Connection) -> None:
     with hapticdb.open(url) as env:
         for n in range(3):
             write_voxels(env.store, blob(n, (30, 30, 30)), f"blob {n}")
@@ -97,7 +93,7 @@ def test_an_index_that_was_left_out_is_made_by_who_writes_and_rows_are_sorted_un
     assert admin.execute("SELECT to_regclass(%s)", (name,)).fetchone() != (None,)
 
 
-def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
+def test_loading_two_loaders_end_together(place: Place) -> None:
     where = place()
     PostgresStore.create(where, GRID).close()
     barrier = threading.Barrier(2)
@@ -124,9 +120,7 @@ def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
 
 
 @pytest.mark.parametrize("is_loading", [False, True])
-def test_an_environment_that_another_writes_or_loads_is_not_discarded(
-    place: Place, is_loading: bool
-) -> None:
+def test_discard_refused_while_others_write(place: Place, is_loading: bool) -> None:
     where = place()
     first = PostgresStore.create(where, GRID)
     second = PostgresStore.open(where)
@@ -141,13 +135,13 @@ def test_an_environment_that_another_writes_or_loads_is_not_discarded(
 
 
 @pytest.mark.parametrize("name", ["a%24%24b", "pg_mine", "public", "", "a%0Ab", "x\udcff"])
-def test_what_cannot_be_a_name_is_refused(database: str, name: str) -> None:
+def test_create_bad_environment_name(database: str, name: str) -> None:
     where = f"{database}{'&' if '?' in database else '?'}environment={name}"
     with pytest.raises(hapticdb.errors.UsageError, match="environment's name"):
         hapticdb.create(where, GRID)
 
 
-def test_tiny_components_of_normals_end_as_in_the_kernels(url: str) -> None:
+def test_statement_tiny_normals_equal_kernels(url: str) -> None:
     """Products that underflow must not fail, though PostgreSQL raises an error for them."""
     env = hapticdb.open(url, read_only=True)
     center = GRID.centers(np.array([[32, 32, 31]]))[0]
@@ -165,7 +159,7 @@ def test_tiny_components_of_normals_end_as_in_the_kernels(url: str) -> None:
     assert by_kernel.torque.tobytes() == by_server.torque.tobytes()
 
 
-def test_a_database_of_another_encoding_serves(place: Place, admin: psycopg.Connection) -> None:
+def test_create_other_encoding(place: Place, admin: psycopg.Connection) -> None:
     admin.execute("DROP DATABASE IF EXISTS other_encoding")
     admin.execute(
         "CREATE DATABASE other_encoding ENCODING 'SQL_ASCII' LOCALE 'C' TEMPLATE template0"
@@ -195,7 +189,7 @@ def large(place: Place) -> hapticdb.Environment:
     return env
 
 
-def test_the_default_resolution_comes_from_the_server(large: hapticdb.Environment) -> None:
+def test_quantiles_default_from_server_statistics(large: hapticdb.Environment) -> None:
     served = large.quantiles()
     assert served.source == "server statistics"
     assert served.resolution == DEFAULT_RESOLUTION == SERVER_RESOLUTION
@@ -209,7 +203,7 @@ def test_the_default_resolution_comes_from_the_server(large: hapticdb.Environmen
 
 
 @pytest.mark.parametrize("form", ["lookup", "scan"])
-def test_frames_are_read_from_the_index_alone(
+def test_frames_index_only_scan(
     large: hapticdb.Environment, admin: psycopg.Connection, form: str
 ) -> None:
     """No heap page is fetched: the visibility map is set after loading."""
@@ -234,7 +228,7 @@ def test_frames_are_read_from_the_index_alone(
 
 
 @pytest.mark.parametrize("reset", ["SET search_path TO {other}", "DISCARD ALL"])
-def test_a_write_behind_a_pooler_of_transactions_is_refused(place: Place, reset: str) -> None:
+def test_write_behind_transaction_pooler_refused(place: Place, reset: str) -> None:
     """A transaction there may have another search path, or none."""
     stores = [PostgresStore.create(place(), GRID, "brick") for _ in range(2)]
     for store in stores:
@@ -258,9 +252,7 @@ def test_a_write_behind_a_pooler_of_transactions_is_refused(place: Place, reset:
         store.close()
 
 
-def test_loading_behind_a_pooler_drops_no_index_of_another(
-    place: Place, admin: psycopg.Connection
-) -> None:
+def test_loading_behind_pooler_keeps_other_indexes(place: Place, admin: psycopg.Connection) -> None:
     one, other = (PostgresStore.create(place(), GRID, "brick") for _ in range(2))
     name = parse(other.url).environment
     one._connection.driver.execute(f"SET search_path TO {name}")

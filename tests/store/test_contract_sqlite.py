@@ -86,7 +86,7 @@ def empty(path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("read_only", [False, True])
-def test_what_is_no_environment_is_told_apart_and_left_alone(
+def test_open_not_an_environment_untouched(
     path: Path, damage: Callable[[Path], None], error: type[Exception], words: str, read_only: bool
 ) -> None:
     damage(path)
@@ -98,7 +98,7 @@ def test_what_is_no_environment_is_told_apart_and_left_alone(
     assert (path.read_bytes() if path.exists() else None) == before
 
 
-def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: Path) -> None:
+def test_open_unprivileged_reader_of_read_only_folder(path: Path, tmp_path: Path) -> None:
     """A WAL database needs its -shm file, which only root could create in this folder."""
     for folder in (tmp_path, *tmp_path.parents):
         if not os.access(folder, os.X_OK) or folder == Path(tmp_path.anchor):
@@ -129,7 +129,7 @@ def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: P
     assert answer == f"{hapticdb.open(path).size().rows} 1"
 
 
-def test_an_immutable_reader_notices_a_writer(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_immutable_reader_notices_writer(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hapticdb.store.sqlite.database_file.needs_immutable", lambda _: True)
     reader = SQLiteStore.open(path, read_only=True)
     monkeypatch.undo()
@@ -140,9 +140,7 @@ def test_an_immutable_reader_notices_a_writer(path: Path, monkeypatch: pytest.Mo
         reader.objects()
 
 
-def test_a_database_in_use_is_told_after_a_while(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_write_busy_database(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hapticdb.store.sqlite.database_file.BUSY_TIMEOUT_MS", 50)
     first, second = SQLiteStore.open(path), SQLiteStore.open(path)
     with (
@@ -154,7 +152,7 @@ def test_a_database_in_use_is_told_after_a_while(
     assert len(first.objects()) == 2
 
 
-def test_an_unfinished_creation_is_swept_away(tmp_path: Path) -> None:
+def test_create_removes_unfinished_creation(tmp_path: Path) -> None:
     """A process that dies while it creates an environment leaves a file of a temporary name."""
     with child([sys.executable, "-c", ""]) as dead:
         pass
@@ -166,7 +164,7 @@ def test_an_unfinished_creation_is_swept_away(tmp_path: Path) -> None:
     assert len(hapticdb.open(tmp_path / "e.db").objects()) == 0
 
 
-def test_a_full_disk_is_told_and_what_was_committed_stays(path: Path) -> None:
+def test_write_disk_full_rolls_back(path: Path) -> None:
     store = SQLiteStore.open(path)
     driver = store._connection.driver
     n_pages = driver.execute("PRAGMA page_count").fetchall()[0][0]
@@ -184,7 +182,7 @@ def test_a_full_disk_is_told_and_what_was_committed_stays(path: Path) -> None:
     assert len(store.objects()) == n_there + 1
 
 
-def test_a_limit_of_file_size_is_no_damage(tmp_path: Path) -> None:
+def test_create_file_size_limit_is_not_damage(tmp_path: Path) -> None:
     program = (
         "import resource, hapticdb\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
@@ -198,7 +196,7 @@ def test_a_limit_of_file_size_is_no_damage(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("free", [0, 1 << 40])
-def test_an_error_of_the_disk_says_whether_it_is_full(
+def test_named_errors_disk_full_or_not(
     path: Path, free: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     space = shutil.disk_usage(path.parent)._replace(free=free)
@@ -209,7 +207,7 @@ def test_an_error_of_the_disk_says_whether_it_is_full(
     assert "not an error" not in str(raised.value)
 
 
-def test_a_read_only_copy_with_an_empty_log_is_read_and_a_full_log_told(
+def test_open_read_only_copy_with_log(
     path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     log = Path(f"{path}-wal")
@@ -229,9 +227,7 @@ def test_a_read_only_copy_with_an_empty_log_is_read_and_a_full_log_told(
             SQLiteStore.open(other, read_only=read_only)
 
 
-def test_loading_fills_the_pages_and_readers_go_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_loading_full_pages_beside_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opened_file, "CHECK_SECONDS", 0.0)
     rng = np.random.default_rng(1)
     parts = [np.unique(rng.integers(0, 64, (200, 3)), axis=0) for _ in range(30)]
@@ -258,7 +254,7 @@ def test_loading_fills_the_pages_and_readers_go_on(
         assert reader.revision() == len(parts) + 1
 
 
-def test_environments_left_open_end_without_a_word(tmp_path: Path) -> None:
+def test_environments_left_open_end_silently(tmp_path: Path) -> None:
     program = (
         "import hapticdb\n"
         "grid = hapticdb.Grid(0.01, (0, 0, 0), 5)\n"

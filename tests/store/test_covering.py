@@ -19,7 +19,7 @@ triples = st.lists(st.integers(-3, 34), min_size=3, max_size=3)
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 @settings(max_examples=40, deadline=None)
 @given(a=triples, b=triples)
-def test_the_ranges_of_a_box_hold_every_row_of_its_voxels(
+def test_box_ranges_contain_all_rows_of_box(
     layout: Layout, curve: CurveName, a: list[int], b: list[int]
 ) -> None:
     """Ranges ascend, are disjoint, merged where they touch, and cut to the grid."""
@@ -44,9 +44,7 @@ def test_the_ranges_of_a_box_hold_every_row_of_its_voxels(
         st.lists(st.integers(0, 2**21 - 1), min_size=3, max_size=3), min_size=2, max_size=2
     )
 )
-def test_a_box_of_any_size_has_a_bounded_number_of_ranges(
-    curve: CurveName, ends: list[list[int]]
-) -> None:
+def test_box_ranges_count_bounded(curve: CurveName, ends: list[list[int]]) -> None:
     """17 cubes lie along the longest edge at most; the outer two layers are not merged."""
     grid = Grid(1.0, (0, 0, 0), 21, curve)
     low, high = np.min(ends, axis=0), np.max(ends, axis=0)

@@ -148,7 +148,7 @@ def outcome(path: Path, content: bytes, log: bytes = b"") -> tuple[bool, str]:
     [8, pytest.param(1000 if is_every() else 200, marks=pytest.mark.long)],
     ids=["short", "long"],
 )
-def test_check_finds_all_damage_of_rows(
+def test_check_environment_damaged_rows(
     tmp_path: Path, kind: tuple[Layout, CurveName, bool], cases: int
 ) -> None:
     """Damage elsewhere, as in the record of an object, is told or harmless, or names are wrong."""
@@ -170,7 +170,7 @@ def test_check_finds_all_damage_of_rows(
     assert found > cases / 4
 
 
-def test_a_damaged_log_leaves_an_earlier_commit(tmp_path: Path) -> None:
+def test_check_environment_damaged_log(tmp_path: Path) -> None:
     sample = made(tmp_path / "e.db", "brick", "z", distances=False)
     for seed in range(12):
         rng = np.random.default_rng(seed)

@@ -8,13 +8,13 @@ import hapticdb
 from hapticdb.errors import MissingExtraError, UsageError
 
 
-def test_a_scheme_that_no_engine_has_is_told() -> None:
+def test_open_unknown_scheme() -> None:
     for url in ("memory://x", "http://host/x", "://x"):
         with pytest.raises(UsageError, match=r"give a path, sqlite:///path or postgresql://"):
             hapticdb.open(url)
 
 
-def test_an_engine_whose_driver_is_missing_says_what_brings_it(
+def test_open_missing_driver(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "psycopg", None)

@@ -23,7 +23,7 @@ def told(*attempts: str) -> HapticDBError:
     return failures.refused(psycopg.OperationalError(text), "postgresql://many/x")
 
 
-def test_each_host_is_named_once_with_its_reasons() -> None:
+def test_refused_names_each_host_once() -> None:
     error = told(
         attempt("one", 5432, f"Connection refused{ADVICE}", "::1"),
         attempt("one", 5432, f"Connection refused{ADVICE}"),
@@ -37,7 +37,7 @@ def test_each_host_is_named_once_with_its_reasons() -> None:
     )
 
 
-def test_hosts_that_are_no_primary_are_left_out() -> None:
+def test_refused_omits_standby_hosts() -> None:
     standby = attempt("standby", 5432, "server is in hot standby mode")
     error = told(standby, attempt("primary", 5432, f"Connection refused{ADVICE}"))
     assert isinstance(error, ConnectionLostError)
@@ -55,7 +55,7 @@ def test_hosts_that_are_no_primary_are_left_out() -> None:
         "no more connections allowed (max_client_conn)",
     ],
 )
-def test_a_full_server_is_named_and_what_to_do(reason: str) -> None:
+def test_refused_server_without_free_connection(reason: str) -> None:
     where = 'connection failed: connection to server on socket "/run/.s.PGSQL.5432" failed: '
     text = f"{where}FATAL:  {reason}"
     error = failures.refused(psycopg.OperationalError(text), "URL")

@@ -29,7 +29,7 @@ NAMES = (
 )
 
 
-def test_names_are_compared_in_normal_form_c(tmp_path: Path) -> None:
+def test_find_names_in_normal_form_c(tmp_path: Path) -> None:
     apart = unicodedata.normalize("NFD", "T\u00fcr/Griff")
     write_obj(tmp_path / "a.obj", {apart: box((0, 0, 0), (0.1, 0.1, 0.1))})
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6))
@@ -89,7 +89,7 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
         (["[t-z]*,hood"], [1, 2, 3, 4, 5]),
     ],
 )
-def test_words_choose_objects(car: Environment, words: list[int | str], ids: list[int]) -> None:
+def test_find_words(car: Environment, words: list[int | str], ids: list[int]) -> None:
     assert [obj.id for obj in car.find(*words)] == ids
 
 
@@ -111,14 +111,14 @@ def test_words_choose_objects(car: Environment, words: list[int | str], ids: lis
         ("[", "no object"),
     ],
 )
-def test_a_word_that_chooses_nothing_is_told(car: Environment, word: int | str, said: str) -> None:
+def test_find_unknown_word(car: Environment, word: int | str, said: str) -> None:
     with pytest.raises(ObjectNotFoundError) as told:
         car.find("tyre", word)
     assert said in str(told.value)
     assert len(str(told.value)) < 400
 
 
-def test_a_shell_of_several_objects_lies_on_all_of_them_where_they_sit(car: Environment) -> None:
+def test_environment_shell_of_several_objects(car: Environment) -> None:
     shell = car.shell("wheels/rear", 5, points=600, seed=3, inset=0.0)
     cubes = np.array([0.4, 0.6, 0.8])  # x of the cubes' centres
     nearest = np.abs(shell.points[:, 0, None] - cubes).argmin(axis=1)
@@ -132,7 +132,7 @@ def test_a_shell_of_several_objects_lies_on_all_of_them_where_they_sit(car: Envi
     assert np.array_equal(again.points, shell.points)
 
 
-def test_a_shell_of_nothing_or_of_points_is_refused(car: Environment, tmp_path: Path) -> None:
+def test_environment_shell_without_surface(car: Environment, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="name at least one"):
         car.shell()
     cloud = trimesh.PointCloud(np.random.default_rng(0).random((50, 3)))
@@ -145,7 +145,7 @@ def test_a_shell_of_nothing_or_of_points_is_refused(car: Environment, tmp_path: 
         env.shell("*")
 
 
-def test_a_shift_moves_all_of_them_or_none(car: Environment) -> None:
+def test_shift_all_or_none(car: Environment) -> None:
     ids = [obj.id for obj in car.find("wheels")]
     before = [obj.transform for obj in car.find("wheels")]
     with pytest.raises(hapticdb.errors.OutsideGridError):

@@ -135,7 +135,7 @@ def places_of(env: Environment) -> list[tuple[Object, Rows]]:
 
 
 @pytest.mark.long
-def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder: Path) -> None:
+def test_touch_eight_readers_one_revision_each(url: str, folder: Path) -> None:
     """One writer moves the shuttle, one imports and removes balls: no frame mixes revisions."""
     assert len(STRATEGIES) <= N_READERS
     pipes = [multiprocessing.Pipe() for _ in range(N_READERS)]
@@ -185,7 +185,7 @@ def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder
         assert [obj.name for obj in env.objects()] == ["shuttle"]
 
 
-def test_a_snapshot_held_open_stops_no_writer(url: str, folder: Path) -> None:
+def test_snapshot_open_blocks_no_writer(url: str, folder: Path) -> None:
     shell = two_tools()
     with hapticdb.open(url, read_only=True) as reader, reader.store.snapshot():
         before = reader.touch(shell, np.eye(4))
@@ -214,7 +214,7 @@ def unfinished_move(url: str) -> Iterator[psycopg.Connection]:
         writer.rollback()
 
 
-def test_a_lock_held_too_long_is_told(url: str) -> None:
+def test_move_remove_lock_timeout(url: str) -> None:
     impatient = f"{url}&options=-clock_timeout%3D200"
     with hapticdb.open(impatient) as env:
         with unfinished_move(url):
@@ -227,7 +227,7 @@ def test_a_lock_held_too_long_is_told(url: str) -> None:
         assert_valid(env)
 
 
-def test_translations_of_two_writers_both_count(url: str) -> None:
+def test_shift_two_writers_both_count(url: str) -> None:
     """Each writer reads, shifts and writes; a writer that was overtaken reads again."""
     n_each, step = 3, "0.001,0,0"
     with processes(shift, *((url, step, n_each) for _ in range(2))) as writers:
@@ -245,7 +245,7 @@ def shift(url: str, step: str, n_times: int) -> None:
         assert main(["move", url, "1", "--translate", step, "--json"]) == 0
 
 
-def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) -> None:
+def test_touch_statement_timeout(url: str, admin: psycopg.Connection) -> None:
     shell, expected = two_tools(), hits_at(url)
     name = parse(url).environment
     with hapticdb.open(f"{url}&options=-cstatement_timeout%3D400", read_only=True) as env:
@@ -284,9 +284,7 @@ def stopped(pid: int) -> Iterator[None]:
             os.kill(pid, signal.SIGCONT)
 
 
-def test_ctrl_c_does_not_wait_for_a_server_that_stopped_answering(
-    url: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_touch_ctrl_c_with_hanging_server(url: str, caplog: pytest.LogCaptureFixture) -> None:
     """psycopg's own handling, which waits for the server, would write to its log."""
     shell, expected = two_tools(), hits_at(url)
     with hapticdb.open(url, read_only=True) as env:

@@ -33,7 +33,7 @@ def environment(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["nfs", "nfs4", "cifs", "smb3"])
-def test_a_file_on_a_network_is_read_and_not_written(
+def test_open_network_file_read_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     path = environment(tmp_path / "a.db")
@@ -48,7 +48,7 @@ def test_a_file_on_a_network_is_read_and_not_written(
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.db", "mountinfo"]
 
 
-def test_a_log_on_a_network_is_not_passed_over(
+def test_open_network_file_with_log_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = SQLiteStore.open(environment(tmp_path / "a.db"))
@@ -59,7 +59,7 @@ def test_a_log_on_a_network_is_not_passed_over(
     writer.close()
 
 
-def test_other_file_systems_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_local_file_systems_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where nothing is listed, as on another operating system, too."""
     mount(monkeypatch, tmp_path, "ext4")
     environment(tmp_path / "a.db")
@@ -67,7 +67,7 @@ def test_other_file_systems_are_written(tmp_path: Path, monkeypatch: pytest.Monk
     environment(tmp_path / "b.db")
 
 
-def test_the_command_line_says_what_to_do(
+def test_remove_network_file_message(
     run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mount(monkeypatch, scene.parent, "cifs")

@@ -85,7 +85,7 @@ class TestPartitionedStore(StoreContract):
 
 
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
-def test_frames_are_those_of_one_server(
+def test_partitions_frames_equal_one_server(
     spread: Spread, file: Path, undisturbed: dict[Layout, Contents], layout: Layout
 ) -> None:
     url = spread.url("frames")
@@ -129,7 +129,7 @@ def _is_idle(lines: list[str], n: int) -> bool:
     return "never executed" in node
 
 
-def test_keys_and_ranges_reach_only_the_partitions_that_have_them(made: str) -> None:
+def test_partitions_reads_reach_needed_servers_only(made: str) -> None:
     with hapticdb.open(made, read_only=True) as env:
         first, second = ends(env.grid, "brick", 3)
         keys = env.store.scan(np.array([0]), np.array([first - 1])).keys[:3]
@@ -148,7 +148,7 @@ def test_keys_and_ranges_reach_only_the_partitions_that_have_them(made: str) -> 
     )
 
 
-def test_what_a_crash_has_left_is_not_felt_and_is_mended(
+def test_partitions_repair_after_crash(
     made: str, spread: Spread, undisturbed: dict[Layout, Contents], run: Run
 ) -> None:
     shell = PointShell.from_mesh(*ball((0, 0, 0), 0.2, 24), 200, seed=1)
@@ -174,7 +174,7 @@ def test_what_a_crash_has_left_is_not_felt_and_is_mended(
 
 
 @pytest.mark.parametrize("step", ["_take", "_put"])
-def test_a_partition_that_dies_in_a_write_leaves_the_environment_as_it_was(
+def test_partitions_lost_server_in_write_rolls_back(
     made: str, spread: Spread, edited: list[Contents], monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     dying = spread.partitions[1]
@@ -195,7 +195,7 @@ def test_a_partition_that_dies_in_a_write_leaves_the_environment_as_it_was(
     assert valid_contents(made)[2] == edited[0][2]
 
 
-def test_an_import_goes_on_after_a_crash_of_each_server(
+def test_partitions_import_resumes_after_crashes(
     spread: Spread, file: Path, undisturbed: dict[Layout, Contents], run: Run
 ) -> None:
     url = spread.url("cut")
@@ -211,7 +211,7 @@ def test_an_import_goes_on_after_a_crash_of_each_server(
     dropped(url)
 
 
-def test_roles_are_those_of_the_environment(made: str, spread: Spread) -> None:
+def test_partitions_roles(made: str, spread: Spread) -> None:
     with psycopg.connect(spread.server.conninfo(), autocommit=True) as server:
         server.execute("CREATE ROLE guest LOGIN")
     guest = made.replace("user=hapticdb", "user=guest", 1)
@@ -231,7 +231,7 @@ def test_roles_are_those_of_the_environment(made: str, spread: Spread) -> None:
         server.execute("DROP ROLE guest")
 
 
-def test_wrong_use_is_one_line(made: str, spread: Spread, file: Path, run: Run) -> None:
+def test_partitions_bad_arguments(made: str, spread: Spread, file: Path, run: Run) -> None:
     one = spread.partitions[0].conninfo()
     line = "only environments on PostgreSQL have partitions"
     refused(run("import", file.with_name("x.db"), file, "--partitions", "a"), line)

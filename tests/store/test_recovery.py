@@ -37,7 +37,7 @@ from validity import Contents, assert_valid, contents, valid_contents
 @pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
-def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
+def test_import_files_repeated_after_server_crashes(
     server: Server, url: str, file: Path, undisturbed: dict[Layout, Contents], layout: Layout
 ) -> None:
     for n_parts, delay in moments(1):
@@ -58,7 +58,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
 
 @pytest.mark.long
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
-def test_an_import_goes_on_by_itself_when_the_server_comes_back(
+def test_import_files_reconnects_after_crash(
     server: Server, url: str, file: Path, undisturbed: dict[Layout, Contents], layout: Layout
 ) -> None:
     crashes = [Killer(n, delay, lambda: crash(server)) for n, delay in moments(2)]
@@ -74,7 +74,7 @@ def test_an_import_goes_on_by_itself_when_the_server_comes_back(
 
 @pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
-def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
+def test_write_server_crash_rolls_back(
     server: Server, url: str, file: Path, edited: list[Contents]
 ) -> None:
     with small(url, file) as env:
@@ -96,7 +96,7 @@ def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
 
 
 @pytest.mark.parametrize(("name", "step"), [(n, s) for n, _ in EDITS for s in steps_of(n)])
-def test_an_edit_goes_on_by_itself_when_the_server_comes_back(
+def test_write_reconnects_after_crash(
     crashing: tuple[Server, Environment], name: str, step: str
 ) -> None:
     server, env = crashing
@@ -120,7 +120,7 @@ def path() -> list[np.ndarray[Any, np.dtype[np.float64]]]:
     return [placement(*rng.uniform(-0.3, 0.3, 3)) for _ in range(60)]
 
 
-def test_a_long_touch_goes_on_through_a_crash(
+def test_touch_path_through_server_crash(
     server: Server,
     url: str,
     file: Path,

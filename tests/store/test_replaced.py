@@ -50,7 +50,7 @@ WRITES: list[Callable[[SQLiteStore], object]] = [
     ("event", "change"),
     [*((replaced, one) for one in WRITES), *((e, WRITES[0]) for e in (deleted, moved))],
 )
-def test_a_write_into_a_file_that_is_gone_is_refused(
+def test_write_replaced_or_missing_file_refused(
     path: Path, event: Callable[[Path], None], change: Callable[[SQLiteStore], object]
 ) -> None:
     words = "another file" if event is replaced else "cannot be reached"
@@ -68,9 +68,7 @@ def test_a_write_into_a_file_that_is_gone_is_refused(
 
 
 @pytest.mark.parametrize("event", [replaced, deleted])
-def test_a_file_that_goes_while_it_is_written_is_not_reported_as_written(
-    path: Path, event: Callable[[Path], None]
-) -> None:
+def test_write_file_replaced_during_transaction(path: Path, event: Callable[[Path], None]) -> None:
     store = SQLiteStore.open(path)
     write(store, 1)
     with (
@@ -81,7 +79,7 @@ def test_a_file_that_goes_while_it_is_written_is_not_reported_as_written(
     store.close()
 
 
-def test_a_reader_never_feels_commits_into_another_file(
+def test_touch_replaced_file_no_foreign_commits(
     path: Path, sphere: hapticdb.PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A store that opens the new file shares the log with the reader, which fails at once."""
@@ -95,7 +93,7 @@ def test_a_reader_never_feels_commits_into_another_file(
                 env.touch(sphere, np.eye(4))
 
 
-def test_opening_again_takes_no_locks_from_who_has_it_open(path: Path) -> None:
+def test_open_again_releases_no_locks(path: Path) -> None:
     """POSIX: a process that closes any descriptor of a file loses all its locks on that file."""
     script = (
         "import sys, apsw\n"

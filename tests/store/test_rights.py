@@ -152,7 +152,7 @@ def allowed(url: str) -> set[str]:
     return found
 
 
-def test_the_server_holds_a_role_to_its_last_right(url: str, roles: dict[Right, str]) -> None:
+def test_grant_last_right_holds(url: str, roles: dict[Right, str]) -> None:
     role = roles["editor"]
     for right in ("editor", "viewer", "toucher", "nobody"):
         grant(url, role, right)
@@ -160,7 +160,7 @@ def test_the_server_holds_a_role_to_its_last_right(url: str, roles: dict[Right, 
         assert allowed(url_as(url, role)) == ALLOWED[right], right
 
 
-def test_an_editor_cannot_pass_its_right_on(url: str, roles: dict[Right, str]) -> None:
+def test_grant_not_passed_on_by_editor(url: str, roles: dict[Right, str]) -> None:
     grant(url, roles["editor"], "editor")
     role, schema = sql.Identifier(roles["nobody"]), sql.Identifier(parse(url).environment)
     theirs = parse(url_as(url, roles["editor"])).conninfo
@@ -172,7 +172,7 @@ def test_an_editor_cannot_pass_its_right_on(url: str, roles: dict[Right, str]) -
     assert allowed(url_as(url, roles["nobody"])) == set()
 
 
-def test_only_the_owner_grants(granted: dict[Right, str], roles: dict[Right, str]) -> None:
+def test_grant_by_owner_only(granted: dict[Right, str], roles: dict[Right, str]) -> None:
     for right, url in granted.items():
         for role in (roles["nobody"], roles[right]):
             with pytest.raises(AccessError, match=r"only the owner|may not read"):
@@ -180,7 +180,7 @@ def test_only_the_owner_grants(granted: dict[Right, str], roles: dict[Right, str
     assert allowed(granted["nobody"]) == set()
 
 
-def test_a_role_that_no_right_can_hold_back_is_refused(
+def test_grant_owner_and_members_refused(
     url: str, roles: dict[Right, str], admin: psycopg.Connection
 ) -> None:
     owner = admin.info.user
@@ -194,7 +194,7 @@ def test_a_role_that_no_right_can_hold_back_is_refused(
     assert allowed(url) == EVERYTHING
 
 
-def test_a_viewer_touches_by_every_strategy_and_writes_nothing(
+def test_grant_viewer_reads_by_every_strategy(
     granted: dict[Right, str], url: str, sphere: PointShell
 ) -> None:
     pose = np.eye(4)
@@ -211,7 +211,7 @@ def test_a_viewer_touches_by_every_strategy_and_writes_nothing(
     assert diff_environments(url, granted["viewer"]).is_equal
 
 
-def test_a_toucher_keeps_costs_and_changes_no_object(granted: dict[Right, str], url: str) -> None:
+def test_grant_toucher_stores_costs_only(granted: dict[Right, str], url: str) -> None:
     with hapticdb.open(granted["toucher"]) as env:
         figures = env.calibrate().figures()
         env.calibrate()
@@ -230,7 +230,7 @@ def test_a_toucher_keeps_costs_and_changes_no_object(granted: dict[Right, str], 
     assert set(kept) == set(figures)
 
 
-def test_an_editor_imports_moves_and_removes(
+def test_grant_editor_imports_moves_removes(
     run: Run, place: Place, roles: dict[Right, str], tmp_path: Path
 ) -> None:
     url = place()
@@ -251,7 +251,7 @@ def test_an_editor_imports_moves_and_removes(
         assert own.store.freshness(quantiles.DEFAULT_RESOLUTION).revision is not None
 
 
-def test_an_editor_fills_an_empty_environment_and_renews_the_servers_statistics(
+def test_grant_editor_fills_empty_environment(
     place: Place, roles: dict[Right, str], tmp_path: Path
 ) -> None:
     url, source = place(), tmp_path / "a.db"
@@ -270,12 +270,12 @@ def test_an_editor_fills_an_empty_environment_and_renews_the_servers_statistics(
         assert write_voxels(env.store, floor_voxels(GRID), "new") == 3
 
 
-def test_who_may_not_make_an_environment_is_told(place: Place, roles: dict[Right, str]) -> None:
+def test_create_without_privilege(place: Place, roles: dict[Right, str]) -> None:
     with pytest.raises(AccessError, match="may not make one"):
         hapticdb.create(url_as(place(), roles["editor"]), GRID)
 
 
-def test_a_right_withdrawn_from_an_open_environment_is_told(
+def test_open_environment_right_withdrawn(
     granted: dict[Right, str], url: str, roles: dict[Right, str]
 ) -> None:
     env = hapticdb.open(granted["editor"])
@@ -292,7 +292,7 @@ def test_a_right_withdrawn_from_an_open_environment_is_told(
     env.close()
 
 
-def test_grant_speaks_one_line(run: Run, url: str, roles: dict[Right, str]) -> None:
+def test_grant_verb_output(run: Run, url: str, roles: dict[Right, str]) -> None:
     words = ("grant", url, roles["toucher"], "--as", "toucher")
     code, out, err = run(*words)
     assert (code, err, len(out.splitlines())) == (0, "", 1)
@@ -334,7 +334,7 @@ def urls_with(password: str) -> Iterator[str]:
 @example(f"{MARK}/{MARK}?{MARK}#{MARK}@{MARK}")
 @example(f"5432/{MARK}@{MARK}%zz{MARK}")
 @example(f"{MARK}[{MARK}]\u2100{MARK}\n{MARK}\0{MARK}")
-def test_no_message_and_no_traceback_shows_a_password(password: str) -> None:
+def test_redact_passwords_in_messages_and_tracebacks(password: str) -> None:
     for url in urls_with(password):
         if url.startswith(("postgresql://", "POSTGRES://")):
             assert MARK not in redact(url), url
@@ -345,7 +345,7 @@ def test_no_message_and_no_traceback_shows_a_password(password: str) -> None:
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"]), max_size=9))
-def test_what_is_no_secret_stays_readable(password: str) -> None:
+def test_redact_only_secrets(password: str) -> None:
     rest = "@host:5433/plant?environment=a&sslmode=require"
     shown = redact(f"postgresql://anna:{quote(password, safe='')}{rest}")
     assert shown == f"postgresql://anna{rest}"
@@ -380,14 +380,14 @@ def files(tmp_path: Path) -> None:
     poses(tmp_path / "path.csv", *PLACES)
 
 
-def test_every_verb_that_takes_a_url_is_tried() -> None:
+def test_redact_checks_cover_every_verb() -> None:
     verbs = {c.name for c in app.registered_commands} - {"sample", "warm", "backup"}
     assert verbs == {*lines("")}
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("files")
-def test_no_verb_prints_a_password_when_all_goes_well(run: Run, place: Place) -> None:
+def test_verbs_print_no_password(run: Run, place: Place) -> None:
     url = f"{place()}&password={MARK}&sslpassword={MARK}"
     for verb, args in lines(url).items():
         if verb != "demo":  # the demo takes long
@@ -413,7 +413,7 @@ def guarded() -> Iterator[Server]:
         yield server
 
 
-def test_a_password_comes_from_where_libpq_takes_it(
+def test_open_password_sources_of_libpq(
     guarded: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     url = guarded.conninfo().replace("user=hapticdb", "user=anna")
@@ -438,7 +438,7 @@ def test_a_password_comes_from_where_libpq_takes_it(
 
 
 @pytest.mark.parametrize("mode", ["require", "verify-full&sslrootcert=system"])
-def test_a_server_without_tls_is_refused_where_tls_is_required(mode: str) -> None:
+def test_open_tls_required(mode: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def decline() -> None:

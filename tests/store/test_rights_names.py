@@ -38,9 +38,7 @@ def may_read(admin: psycopg.Connection, role: str, url: str) -> bool:
     return bool(row[0])
 
 
-def test_a_role_name_that_is_too_long_is_not_granted_to_its_beginning(
-    place: Place, role: str, admin: psycopg.Connection
-) -> None:
+def test_grant_role_name_too_long(place: Place, role: str, admin: psycopg.Connection) -> None:
     url = place()
     create_store(url, GRID).close()
     for longer in (role + "語", role + "r" * 10_000):
@@ -65,9 +63,7 @@ def test_a_role_name_that_is_too_long_is_not_granted_to_its_beginning(
         (None, "give a str, not NoneType"),
     ],
 )
-def test_a_role_name_that_is_no_text_is_refused_in_a_line(
-    place: Place, name: str, told: str
-) -> None:
+def test_grant_role_name_bad_characters(place: Place, name: str, told: str) -> None:
     url = place()
     create_store(url, GRID).close()
     with pytest.raises(UsageError, match=rf"^a role's name [^\n]*{told}[^\n]*$"):
@@ -86,7 +82,7 @@ def test_a_role_name_that_is_no_text_is_refused_in_a_line(
         f"postgresql:///?%75ser={LONG}",
     ],
 )
-def test_a_login_that_the_server_would_cut_off_is_refused(url: str) -> None:
+def test_parse_url_name_too_long(url: str) -> None:
     with pytest.raises(UsageError, match=r"'s name '\S+' is longer than the 63 bytes") as error:
         parse(url)
     assert "secret" not in str(error.value)
@@ -94,7 +90,7 @@ def test_a_login_that_the_server_would_cut_off_is_refused(url: str) -> None:
 
 
 @pytest.mark.parametrize("letter", ["r", "é", "語"])
-def test_an_environment_name_is_measured_in_bytes(letter: str) -> None:
+def test_environment_name_length_in_bytes(letter: str) -> None:
     name = of_bytes("", letter)
     assert parse(with_environment("postgresql:///db", name)).environment == name
     for wrong in (name + letter, "\udcff", "\ud800", "a\0b"):

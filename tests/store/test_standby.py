@@ -70,7 +70,7 @@ def await_replay(pair: Pair) -> None:
         until(lambda: here.execute(reached, row).fetchone() == (True,))
 
 
-def test_a_standby_gives_the_primarys_answers(pair: Pair, sphere: PointShell) -> None:
+def test_standby_same_answers_as_primary(pair: Pair, sphere: PointShell) -> None:
     poses = np.tile(np.eye(4), (len(PLACES), 1, 1))
     poses[:, :3, 3] = PLACES
     with (
@@ -93,7 +93,7 @@ def test_a_standby_gives_the_primarys_answers(pair: Pair, sphere: PointShell) ->
                 )
 
 
-def test_a_standby_tells_of_the_commits_that_it_follows(pair: Pair) -> None:
+def test_standby_has_changed_follows_commits(pair: Pair) -> None:
     with contextlib.closing(PostgresStore.open(pair.both, read_only=True)) as reader:
         reader.watch()
         for n in range(3):
@@ -106,7 +106,7 @@ def test_a_standby_tells_of_the_commits_that_it_follows(pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("is_standby", [True, False])
-def test_a_session_reads_its_cells_and_its_lag_from_it(pair: Pair, *, is_standby: bool) -> None:
+def test_standby_session_cells_and_lag(pair: Pair, *, is_standby: bool) -> None:
     url = pair.both if is_standby else pair.primary
     table = CellTable.create(LEAST_BUDGET)
     with hapticdb.open(url, read_only=True) as env:
@@ -121,7 +121,7 @@ def test_a_session_reads_its_cells_and_its_lag_from_it(pair: Pair, *, is_standby
         table.close()
 
 
-def test_it_refuses_to_be_written_in_one_line(pair: Pair, run: Run, made: Path) -> None:
+def test_standby_refuses_writes(pair: Pair, run: Run, made: Path) -> None:
     for url in (pair.both, pair.standby):
         for line in (
             ("import", url, made / "boxes.glb"),

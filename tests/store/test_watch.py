@@ -55,7 +55,7 @@ def write(where: str) -> None:
 
 
 @pytest.mark.parametrize("is_replaced", [False, True])
-def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
+def test_has_changed_file_missing_or_replaced(
     file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_replaced: bool
 ) -> None:
     monkeypatch.setattr(sqlite_place, "CHECK_SECONDS", 0.0)
@@ -99,7 +99,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return found
 
 
-def test_a_reader_that_lost_its_connection_listens_again(
+def test_has_changed_after_reconnect(
     url: str, reader: PostgresStore, admin: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(watching, "LISTENING_S", 1e9)
@@ -116,7 +116,7 @@ def test_a_reader_that_lost_its_connection_listens_again(
         assert is_noticed(reader)
 
 
-def test_a_writer_that_does_not_notify_is_noticed_too(
+def test_has_changed_without_notification(
     url: str, reader: PostgresStore, admin: psycopg.Connection
 ) -> None:
     schema = sql.Identifier(parse(url).environment)
@@ -127,7 +127,7 @@ def test_a_writer_that_does_not_notify_is_noticed_too(
         assert not reader.has_changed()
 
 
-def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
+def test_has_changed_without_listen(
     url: str, asked: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command = ServerConnection.command
@@ -149,9 +149,7 @@ def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
     reader.close()
 
 
-def test_an_environment_made_anew_is_told_from_the_one_before(
-    url: str, reader: PostgresStore
-) -> None:
+def test_has_changed_recreated_environment(url: str, reader: PostgresStore) -> None:
     write(url)
     assert is_noticed(reader)
     with contextlib.closing(PostgresStore.open(url)) as store:
@@ -168,7 +166,7 @@ def test_an_environment_made_anew_is_told_from_the_one_before(
     again.close()
 
 
-def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.Connection) -> None:
+def test_channel_and_payload_as_documented(url: str, admin: psycopg.Connection) -> None:
     channel = f"hapticdb_{parse(url).environment}"
     admin.execute(sql.SQL("LISTEN {}").format(sql.Identifier(channel)))
     write(url)
@@ -177,7 +175,7 @@ def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.
     assert [(n.channel, n.payload) for n in heard] == [(channel, "1"), (channel, "2")]
 
 
-def test_long_names_have_channels_of_their_own_that_the_server_takes() -> None:
+def test_channel_of_long_names_distinct() -> None:
     names = ["n" * LONGEST_NAME, "n" * (LONGEST_NAME - 1) + "m", "語" * 21, "語" * 20 + "本"]
     channels = {channel_of(name) for name in names}
     assert len(channels) == len(names)
@@ -202,7 +200,7 @@ def stranger(database: str, admin: psycopg.Connection) -> Iterator[psycopg.Conne
         yield connection
 
 
-def test_words_of_strangers_on_the_channel_hide_no_edit(
+def test_has_changed_forged_notifications(
     url: str, reader: PostgresStore, stranger: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each edit is noticed by its own notification, as without forged ones."""
@@ -228,7 +226,7 @@ def test_words_of_strangers_on_the_channel_hide_no_edit(
     assert seen == {False: list(range(1, n + 1)), True: list(range(n + 1, 2 * n + 1))}
 
 
-def test_a_flood_of_notifications_leads_to_few_round_trips(
+def test_has_changed_notification_flood(
     url: str,
     reader: PostgresStore,
     stranger: psycopg.Connection,

@@ -82,7 +82,7 @@ def run_frames(session: HostedSession, count: int) -> None:
     until(lambda: session.figures().frames >= before + count)
 
 
-def test_the_floor_pushes_the_hand_up_and_is_named_while_it_is_touched(
+def test_host_floor_force_and_touched_objects(
     session: HostedSession, distance_floor: Environment
 ) -> None:
     (floor,) = distance_floor.find("floor")
@@ -97,7 +97,7 @@ def _height(session: HostedSession) -> float:
     return float(last["hand"][0, 2])
 
 
-def test_contacts_lie_on_the_floor_and_their_forces_lift_the_tool(session: HostedSession) -> None:
+def test_host_contacts_on_floor(session: HostedSession) -> None:
     press([session], lambda: pushed(session) > 0.5 and len(session.contacts()[0]))
     points, forces = session.contacts()
     assert points.shape == forces.shape
@@ -105,7 +105,7 @@ def test_contacts_lie_on_the_floor_and_their_forces_lift_the_tool(session: Hoste
     assert forces[:, 2].sum() > 0.0
 
 
-def test_a_recording_replays_bit_for_bit(
+def test_host_recording_replays_same_bits(
     session: HostedSession, distance_floor: Environment, tmp_path: Path
 ) -> None:
     press([session], lambda: pushed(session) > 0.5)
@@ -129,7 +129,7 @@ def test_a_recording_replays_bit_for_bit(
     assert result.is_equal, result.describe()
 
 
-def test_objects_that_a_session_leaves_out_are_not_felt(
+def test_host_excluded_objects(
     host: SessionHost, sphere: PointShell, session: HostedSession
 ) -> None:
     without = host.begin(sphere, ABOVE, exclude=["floor"])
@@ -142,7 +142,7 @@ def test_objects_that_a_session_leaves_out_are_not_felt(
     assert len(host.cells) == 1
 
 
-def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
+def test_host_cell_edited_beside_resting_tool(
     host: SessionHost, distance_floor: Environment
 ) -> None:
     """The tool rests above the floor, and something is put where it is."""
@@ -164,12 +164,12 @@ def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
     "pose",
     [np.zeros((4, 4)), np.full((4, 4), np.nan), at(2e9, 0.0, 0.0), np.ones(7), np.full(7, np.nan)],
 )
-def test_a_pose_that_is_none_is_refused(session: HostedSession, pose: Floats) -> None:
+def test_hosted_session_bad_pose(session: HostedSession, pose: Floats) -> None:
     with pytest.raises(UsageError):
         session.move(pose)
 
 
-def test_a_scene_at_survey_coordinates_is_felt(tmp_path: Path, sphere: PointShell) -> None:
+def test_host_survey_coordinates(tmp_path: Path, sphere: PointShell) -> None:
     where = np.array([515_369.0, 4_918_340.0, 2_322.0])
     box = trimesh.creation.box((0.2, 0.2, 0.1))
     box.vertices += where - (0.0, 0.0, 0.05)  # its top is at `where`
@@ -182,7 +182,7 @@ def test_a_scene_at_survey_coordinates_is_felt(tmp_path: Path, sphere: PointShel
         session.end()
 
 
-def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell) -> None:
+def test_hosted_session_ended(host: SessionHost, sphere: PointShell) -> None:
     session = host.begin(sphere, ABOVE)
     session.end()
     session.end()
@@ -195,7 +195,7 @@ def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell)
 @pytest.mark.parametrize(
     ("floor", "rendering"), [("voxel_floor", None), ("distance_floor", "direct")]
 )
-def test_a_hand_rendered_directly_gets_each_frames_wrench(
+def test_host_direct_rendering_frame_wrench(
     floor: str, rendering: Rendering | None, request: pytest.FixtureRequest, sphere: PointShell,
     tmp_path: Path,
 ) -> None:  # fmt: skip
@@ -215,7 +215,7 @@ def test_a_hand_rendered_directly_gets_each_frames_wrench(
     assert result.is_equal, result.describe()
 
 
-def test_a_coupled_hand_needs_distances(voxel_floor: Environment, sphere: PointShell) -> None:
+def test_host_coupling_needs_distances(voxel_floor: Environment, sphere: PointShell) -> None:
     with (
         SessionHost(voxel_floor.url, rate=RATE, rendering="coupled") as host,
         pytest.raises(UsageError, match=r"import with distances .* leave out --rendering coupled"),
@@ -223,7 +223,7 @@ def test_a_coupled_hand_needs_distances(voxel_floor: Environment, sphere: PointS
         host.begin(sphere, ABOVE)
 
 
-def test_a_host_takes_no_more_sessions_than_its_board_has_seats(
+def test_host_session_limit(
     distance_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "MOST_SESSIONS", 1)
@@ -235,7 +235,7 @@ def test_a_host_takes_no_more_sessions_than_its_board_has_seats(
         host.begin(sphere, ABOVE)
 
 
-def test_another_process_begins_sessions_which_end_when_it_leaves(
+def test_attached_host_sessions_end_on_detach(
     host: SessionHost, session: HostedSession, sphere: PointShell
 ) -> None:
     ours, theirs = socket.socketpair()
@@ -266,7 +266,7 @@ time.sleep(600)
 """
 
 
-def test_the_sessions_of_a_process_that_dies_end(host: SessionHost) -> None:
+def test_attached_host_sessions_end_with_dead_client(host: SessionHost) -> None:
     ours, theirs = socket.socketpair()
     with theirs, child([sys.executable, "-c", CLIENT], stdin=theirs.fileno(), stderr=None) as other:
         host.serve(ours)
@@ -277,7 +277,7 @@ def test_the_sessions_of_a_process_that_dies_end(host: SessionHost) -> None:
     until(lambda: not host.sessions())
 
 
-def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
+def test_host_dead_worker_ends_its_sessions(
     distance_floor: Environment, sphere: PointShell
 ) -> None:
     with SessionHost(distance_floor.url, rate=RATE, budget_bytes=8 << 20) as host:
@@ -291,9 +291,7 @@ def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
         press([another], lambda: pushed(another) > 0.5)
 
 
-def test_a_closed_host_leaves_no_process_and_refuses_sessions(
-    distance_floor: Environment, sphere: PointShell
-) -> None:
+def test_host_close_ends_processes(distance_floor: Environment, sphere: PointShell) -> None:
     host = SessionHost(distance_floor.url, rate=RATE, budget_bytes=8 << 20)
     host.begin(sphere, ABOVE)
     pids = [*host.pids, *(cells.pid for cells in host.cells)]
@@ -304,23 +302,21 @@ def test_a_closed_host_leaves_no_process_and_refuses_sessions(
         host.begin(sphere, ABOVE)
 
 
-def test_numbers_out_of_range_are_refused(distance_floor: Environment) -> None:
+def test_host_numbers_out_of_range(distance_floor: Environment) -> None:
     with pytest.raises(UsageError, match="give 10 to"):
         SessionHost(distance_floor.url, rate=5.0)
     with pytest.raises(UsageError, match="give 1 or more"):
         SessionHost(distance_floor.url, processes=0)
 
 
-def test_the_other_end_of_a_closed_socket_is_an_error() -> None:
+def test_attached_host_closed_socket() -> None:
     ours, theirs = socket.socketpair()
     ours.close()
     with pytest.raises(HapticDBError, match="no host"):
         AttachedHost(theirs)
 
 
-def test_sixty_four_sessions_share_a_table_and_all_feel_the_floor(
-    distance_floor: Environment, sphere: PointShell
-) -> None:
+def test_host_64_sessions_share_table(distance_floor: Environment, sphere: PointShell) -> None:
     with SessionHost(distance_floor.url, rate=250.0, budget_bytes=16 << 20, processes=1) as host:
         sessions = [host.begin(sphere, ABOVE) for _ in range(64)]
         assert len(host.cells) == len(host.pids) == 1
@@ -333,9 +329,7 @@ def test_sixty_four_sessions_share_a_table_and_all_feel_the_floor(
         until(lambda: all(session.latest() is not None for session in again))
 
 
-def test_an_overloaded_worker_runs_all_sessions_at_the_same_lower_rate(
-    distance_floor: Environment, sphere: PointShell
-) -> None:
+def test_host_overload_same_lower_rate(distance_floor: Environment, sphere: PointShell) -> None:
     with SessionHost(distance_floor.url, rate=20_000.0, budget_bytes=16 << 20, processes=1) as host:
         sessions = [host.begin(sphere, PRESSED) for _ in range(24)]
 
@@ -351,9 +345,7 @@ def test_an_overloaded_worker_runs_all_sessions_at_the_same_lower_rate(
         assert all(one.missed > 0.1 * one.frames for one in figures)
 
 
-def test_a_database_that_does_not_answer_lets_the_force_fall_until_it_does(
-    distance_floor: Environment, sphere: PointShell
-) -> None:
+def test_host_silent_database_force_fades(distance_floor: Environment, sphere: PointShell) -> None:
     with SessionHost(distance_floor.url, rate=250.0, budget_bytes=16 << 20) as host:
         session = host.begin(sphere, ABOVE)
         press([session], lambda: pushed(session) > 0.5)

@@ -61,7 +61,7 @@ def full(*_: object, **__: object) -> NoReturn:
     raise OSError(errno.EMFILE, "Too many open files", "/secret/path")
 
 
-def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_fails_at_it(
+def test_host_machine_error_ends_each_session(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     ended: list[int] = []
@@ -96,7 +96,7 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
     assert [record.exc_info is not None for record in caplog.records] == [True, True]
 
 
-def test_a_frame_that_is_never_finished_is_an_error() -> None:
+def test_shared_table_unfinished_frame() -> None:
     shared = SharedTable.create(1)
     row = shared.take(7)
     shared.slots["contacts_sequence"][row] = 1
@@ -105,7 +105,7 @@ def test_a_frame_that_is_never_finished_is_an_error() -> None:
     shared.close()
 
 
-def test_looking_after_sessions_survives_errors_and_logs_each_once(
+def test_supervisor_survives_errors_logged_once(
     host: SessionHost,
     session: HostedSession,
     sphere: PointShell,
@@ -134,7 +134,7 @@ def test_looking_after_sessions_survives_errors_and_logs_each_once(
     assert host.failure is None
 
 
-def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
+def test_host_slow_begin_blocks_no_supervision(
     host: SessionHost,
     session: HostedSession,
     sphere: PointShell,
@@ -169,7 +169,7 @@ def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
             joined(thread)
 
 
-def test_a_recording_that_lost_frames_says_how_many(
+def test_hosted_recording_counts_lost_frames(
     host: SessionHost, session: HostedSession, tmp_path: Path
 ) -> None:
     session.record(tmp_path / "late.hdbrec")

@@ -71,7 +71,7 @@ def ball() -> PointShell:
     return PointShell.sphere(RADIUS, 300)
 
 
-def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
+def test_session_force_is_stiffness_times_depth(
     cells: ResidentCells, ball: PointShell, tmp_path: Path
 ) -> None:
     assert cells.has_distances
@@ -94,7 +94,7 @@ def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
 
 
 @pytest.mark.parametrize("law", [TangentPlane(800.0), DistanceField(800.0)])
-def test_direct_rendering_sends_the_wrench_of_a_touch_up_to_the_caps(
+def test_session_direct_rendering_up_to_caps(
     cells: ResidentCells,
     ball: PointShell,
     distance_floor: Environment,
@@ -123,9 +123,7 @@ def test_direct_rendering_sends_the_wrench_of_a_touch_up_to_the_caps(
     assert report.peak_force == pytest.approx(1.0)
 
 
-def test_a_stiffness_too_great_for_the_device_is_lowered_and_reported(
-    cells: ResidentCells, ball: PointShell
-) -> None:
+def test_session_stiffness_lowered_for_device(cells: ResidentCells, ball: PointShell) -> None:
     hand = SimulatedDevice(still(0.03))
     report = felt(cells, ball, hand, seconds=0.1, coupling=Coupling(stiffness=50_000.0))
     assert isinstance(report.coupling, SettledCoupling)
@@ -133,9 +131,7 @@ def test_a_stiffness_too_great_for_the_device_is_lowered_and_reported(
     assert str(report.coupling.lowered).startswith("stiffness 5e+04 N/m lowered to")
 
 
-def test_the_device_feels_the_same_stiffness_at_another_scale(
-    cells: ResidentCells, ball: PointShell
-) -> None:
+def test_session_stiffness_scale_invariant(cells: ResidentCells, ball: PointShell) -> None:
     """The same path at the device presses S times as deep in the scene, with the same force."""
     hand = pressing(0.016)
     hand._knots[:, 1:4] /= 4.0
@@ -143,9 +139,7 @@ def test_the_device_feels_the_same_stiffness_at_another_scale(
     assert report.peak_force == pytest.approx(4.0, abs=0.4)
 
 
-def test_a_tool_that_starts_in_something_feels_nothing_until_it_is_free(
-    cells: ResidentCells, ball: PointShell
-) -> None:
+def test_session_starts_inside_object_no_force(cells: ResidentCells, ball: PointShell) -> None:
     report = felt(cells, ball, still(SIZE * (HEIGHT - 32.0)), seconds=0.3)
     assert report.peak_force == 0.0
     assert report.inside_frames == report.loop.frames
@@ -153,7 +147,7 @@ def test_a_tool_that_starts_in_something_feels_nothing_until_it_is_free(
     assert (report.enclosing_objects, report.objects) == ((1,), ())
 
 
-def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_when(
+def test_session_comes_free_reported_and_recorded(
     cells: ResidentCells, ball: PointShell, tmp_path: Path
 ) -> None:
     inside = SIZE * (HEIGHT - 32.0)
@@ -182,7 +176,7 @@ def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_whe
     assert report.peak_force == pytest.approx(4.0, abs=0.4)
 
 
-def test_a_law_and_a_coupling_that_do_not_fit_are_refused(
+def test_session_incompatible_law_and_coupling(
     cells: ResidentCells, ball: PointShell, tmp_path: Path
 ) -> None:
     with pytest.raises(UsageError, match="does not go with the rendering direct"):

@@ -24,9 +24,7 @@ from voxels import floor_voxels
 
 
 @pytest.mark.parametrize("reads_distances", [False, True])
-def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
-    sphere: PointShell, *, reads_distances: bool
-) -> None:
+def test_periods_revision_of_cells_read(sphere: PointShell, *, reads_distances: bool) -> None:
     """Others write just before its kernel begins, and again as soon as it has ended."""
     grid, slots, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SLOT), np.zeros((1, 4), FRAME)
     with CellTable.create(8 << 20, distances=reads_distances) as table, table.reading() as row:
@@ -50,9 +48,7 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
         assert rings["revision"][0].tolist() == [7, 8, 9, 0]
 
 
-def test_edits_are_felt_and_no_frame_mixes_two_revisions(
-    sphere: PointShell, tmp_path: Path
-) -> None:
+def test_session_edits_no_mixed_revisions(sphere: PointShell, tmp_path: Path) -> None:
     """The floor moves 6 mm down under a hand that presses 2 mm into it, and returns."""
     edited, path = floored(make(tmp_path, bits=6)), tmp_path / "edited.hdbrec"
     up = floor_voxels(edited.grid, width=48)

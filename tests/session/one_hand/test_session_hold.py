@@ -47,7 +47,7 @@ def check_falling(frames: Recorded) -> None:
 
 
 @pytest.mark.long
-def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
+def test_session_killed_prefetch_process_restarts(
     voxel_floor: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "killed.hdbrec"
@@ -84,7 +84,7 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
     assert replay(Recording(path), voxel_floor).is_equal
 
 
-def test_unknown_cells_hold_and_fade(sphere: PointShell, tmp_path: Path) -> None:
+def test_session_unknown_cells_hold_and_fade(sphere: PointShell, tmp_path: Path) -> None:
     """The prefetch process is stopped while the hand moves far."""
     path = Player([0.0, 0.4, 3600.0], [at(x, 0.0, 0.010) for x in (-0.45, 0.45, 0.45)])
     hand = Beckoned(path, tmp_path / "come")

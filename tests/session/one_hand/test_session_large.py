@@ -59,7 +59,7 @@ def felt(ground: Ground, shell: PointShell, path: Path) -> Report:
     return report
 
 
-def test_clusters_of_a_large_tool_sleep_and_change_no_bit(ground: Ground, tmp_path: Path) -> None:
+def test_session_large_tool_clusters_same_bits(ground: Ground, tmp_path: Path) -> None:
     plate = standing_plate()
     report = felt(ground, plate, tmp_path / "s.hdbrec")
     assert report.contact_frames > 0

@@ -31,7 +31,7 @@ def force_in(path: Path) -> float:
 
 
 @pytest.mark.long
-def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
+def test_session_dropped_leaves_nothing(
     voxel_floor: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     path, record = tmp_path / "wrench", tmp_path / "dropped.hdbrec"
@@ -60,7 +60,7 @@ def n_memories() -> int:
     return sum("hapticdb-" in name.name for name in found)
 
 
-def test_cells_that_are_dropped_are_given_back(voxel_floor: Environment) -> None:
+def test_resident_cells_dropped_released(voxel_floor: Environment) -> None:
     n_before = n_memories()
     cells = ResidentCells(voxel_floor.url, budget_bytes=4 << 20)
     pid = cells.pid
@@ -83,7 +83,7 @@ def in_a_fork(work: Callable[[], object]) -> int:
 
 
 @pytest.mark.long
-def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
+def test_session_forked_copy_does_not_end_it(
     voxel_floor: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "forked.hdbrec"
@@ -106,7 +106,7 @@ def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
     assert len(Recording(path)) == report.loop.frames
 
 
-def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
+def test_session_unclosable_recording_leaves_nothing(
     voxel_floor: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_: Recorder) -> None:
@@ -124,7 +124,7 @@ def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
     session.close()
 
 
-def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
+def test_session_two_signals_at_start(
     voxel_floor: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first signal interrupts the start, the second the cleaning up after the first."""
@@ -147,7 +147,7 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
         assert not path.exists()
 
 
-def test_a_device_that_hangs_is_named_when_its_session_ends(
+def test_session_hanging_device_named(
     voxel_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "END_TIMEOUT", 0.1)
@@ -163,7 +163,7 @@ def test_a_device_that_hangs_is_named_when_its_session_ends(
 # -- wrong arguments -----------------------------------------------------------------------------
 
 
-def test_cells_that_are_closed_are_refused(voxel_floor: Environment, sphere: PointShell) -> None:
+def test_session_closed_cells_refused(voxel_floor: Environment, sphere: PointShell) -> None:
     with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
         pass
     with pytest.raises(UsageError, match=r"^these cells are closed: make others$"):
@@ -171,7 +171,7 @@ def test_cells_that_are_closed_are_refused(voxel_floor: Environment, sphere: Poi
 
 
 @pytest.mark.long
-def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
+def test_session_slow_process_start_is_not_death(
     voxel_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
@@ -196,7 +196,7 @@ with Session(sys.argv[1], points, still(0.010), law="plane", rate=100.0) as sess
 
 
 @pytest.mark.long
-def test_processes_end_with_the_one_that_started_them(
+def test_session_processes_end_with_parent(
     voxel_floor: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     sphere.save(tmp_path / "sphere.npz")

@@ -161,7 +161,7 @@ def told(*numbers: ArrayLike) -> NDArray[np.void]:
 
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=25)
-def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> None:
+def test_prefetch_request_cells_nearest_first(seed: int) -> None:
     """All cells within the hand's reach are wanted, also at the border of the grid."""
     grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
     rng = np.random.default_rng(seed)
@@ -190,7 +190,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
         assert urgency[cells.tolist().index(int(cell_key(*at_tool[0])))] == 0.0
 
 
-def test_a_wish_too_large_keeps_what_is_near() -> None:
+def test_prefetch_request_truncated_to_nearest() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 16)
     tool = np.array([grid.edge * 0.9, 0.1, grid.edge / 2])
     request = PrefetchRequest.of_record(
@@ -202,7 +202,7 @@ def test_a_wish_too_large_keeps_what_is_near() -> None:
     assert int(cell_key(*grid.voxels_of(tool[None])[0])) in cells.tolist()
 
 
-def test_a_motion_that_is_none_wants_nothing() -> None:
+def test_prefetch_request_non_finite_motion() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
     rest = np.zeros(3)
     for broken in (np.nan, np.inf):
@@ -214,9 +214,7 @@ def test_a_motion_that_is_none_wants_nothing() -> None:
 # --- in lock step -------------------------------------------------------------------------------
 
 
-def test_a_hand_at_1_m_s_meets_no_unknown_cell_behind_10_ms(
-    world: Environment, sphere: PointShell
-) -> None:
+def test_fetcher_hand_at_1_m_s_no_unknown_cell(world: Environment, sphere: PointShell) -> None:
     step = LockStep(world, sphere, latency=0.010, jitter=0.003)
     step.warm_start()
     step.hand = RandomHand(step.pose, 0, speed=1.0, angular_speed=3.0, clock=lambda: step.now)
@@ -226,7 +224,7 @@ def test_a_hand_at_1_m_s_meets_no_unknown_cell_behind_10_ms(
     assert step.unknown == 0
 
 
-def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
+def test_fetcher_recovers_from_errors(world: Environment, sphere: PointShell) -> None:
     step = LockStep(world, sphere)
     step.warm_start()
     trouble = functools.partial(troubled, wait=step.wait, latency=0.002, errors=0.1, seed=3)
@@ -255,7 +253,7 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
     assert step.side.reader.evaluate(step.pose)[0] == naive.hits
 
 
-def test_the_heartbeat_waits_for_an_answer(
+def test_fetcher_heartbeat_needs_answer(
     world: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Silence about commits does not move the heartbeat; the answer to a revision query does."""
@@ -289,7 +287,7 @@ def test_the_heartbeat_waits_for_an_answer(
     assert int(control["heartbeat"]) == heard
 
 
-def test_a_round_asks_nothing_when_nothing_has_moved(
+def test_fetcher_idle_round_sends_no_query(
     world: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = LockStep(world, sphere)
@@ -307,7 +305,7 @@ def test_a_round_asks_nothing_when_nothing_has_moved(
     assert step.is_served
 
 
-def test_objects_are_named_and_named_anew_after_a_write(tmp_path: Path, sphere: PointShell) -> None:
+def test_fetcher_object_names_after_writes(tmp_path: Path, sphere: PointShell) -> None:
     env = make(tmp_path)
     first = write_voxels(env.store, block((50, 50, 58), (78, 78, 63)), "first")
     step = LockStep(env, sphere)
@@ -337,7 +335,7 @@ def resident(world: Environment) -> Iterator[ResidentCells]:
         yield cells
 
 
-def test_a_process_brings_in_what_is_told_and_notices_writes(
+def test_resident_cells_prefetch_and_follow_writes(
     world: Environment, resident: ResidentCells, sphere: PointShell
 ) -> None:
     side = Side(resident.table, world.grid, sphere)
@@ -356,7 +354,7 @@ def test_a_process_brings_in_what_is_told_and_notices_writes(
     assert figures.restarts == figures.losses == 0
 
 
-def test_what_fails_at_the_start_is_told_in_one_line(
+def test_resident_cells_start_errors(
     tmp_path: Path, world: Environment, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):

@@ -63,7 +63,7 @@ def served(cells: ResidentCells, shell: PointShell, pose: NDArray[np.float64]) -
     return side
 
 
-def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
+def test_fetcher_file_removed_and_restored(
     env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     pose = np.eye(4)
@@ -77,7 +77,7 @@ def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
     assert (cells.figures().losses, cells.restarts) == (1, 0)
 
 
-def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
+def test_fetcher_file_replaced_while_dead(
     env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     """Also when the new file gets the old inode number: both have the same revision."""
@@ -94,7 +94,7 @@ def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
     assert cells.restarts == 1
 
 
-def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its_number(
+def test_fetcher_lost_file_stays_open_until_replaced(
     env: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     pose = np.eye(4)
@@ -120,7 +120,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         fetching.close()
 
 
-def test_another_grid_ends_the_fetching_and_is_told(
+def test_fetcher_other_grid_ends_session(
     env: Environment, cells: ResidentCells, tmp_path: Path
 ) -> None:
     replace(env, tmp_path / "other", bits=6)
@@ -139,7 +139,7 @@ def test_another_grid_ends_the_fetching_and_is_told(
     assert (cells.pid, cells.restarts) == (pid, 0)
 
 
-def test_threads_that_supervise_together_start_one_process(
+def test_supervise_threads_start_one_process(
     cells: ResidentCells, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     os.kill(cells.pid, signal.SIGKILL)

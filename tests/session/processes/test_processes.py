@@ -30,7 +30,7 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]), prepend=os.pathsep)
 
 
-def test_messages_come_whole_and_in_order_whatever_is_printed() -> None:
+def test_process_messages_whole_and_in_order() -> None:
     large = list(range(100_000))
     with Process(WORKERS, ("echo", large), []) as process:
         assert process.receive(LONG) == Message("heard", large)
@@ -40,7 +40,7 @@ def test_messages_come_whole_and_in_order_whatever_is_printed() -> None:
         assert process.wait(LONG)
 
 
-def test_messages_come_in_a_program_with_many_open_files() -> None:
+def test_process_messages_with_many_open_files() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, before[1]), before[1]))
     with contextlib.ExitStack() as opened:
@@ -52,7 +52,7 @@ def test_messages_come_in_a_program_with_many_open_files() -> None:
             assert process.receive(0.01) is None
 
 
-def test_its_errors_are_raised_here() -> None:
+def test_process_error_raised_in_parent() -> None:
     with (
         Process(WORKERS, ("fail", None), []) as process,
         pytest.raises(DatabaseError, match=r"^no such place: make it first$"),
@@ -68,7 +68,7 @@ def test_its_errors_are_raised_here() -> None:
         ("end of file", "EOFError: of something else$"),
     ],
 )
-def test_what_nobody_expected_is_one_line_here(word: str, cause: str) -> None:
+def test_process_unexpected_error_one_line(word: str, cause: str) -> None:
     with (
         Process(WORKERS, (word, None), []) as process,
         pytest.raises(HapticDBError, match=f"the session's process ended: {cause}"),
@@ -76,7 +76,7 @@ def test_what_nobody_expected_is_one_line_here(word: str, cause: str) -> None:
         process.receive(LONG)
 
 
-def test_a_request_of_the_script_itself_is_refused_with_the_way_out(
+def test_process_request_of_script_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Mine:
@@ -93,7 +93,7 @@ def test_a_request_of_the_script_itself_is_refused_with_the_way_out(
         process.receive(LONG)
 
 
-def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
+def test_process_end_then_kill(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "END_TIMEOUT", 0.5)
@@ -106,7 +106,7 @@ def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
         process.end()
 
 
-def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
+def test_process_sigterm_tidies_up() -> None:
     with Process(WORKERS, ("tidy", None), []) as process:
         assert process.receive(LONG) == Message("waiting")
         os.kill(process.pid, signal.SIGTERM)
@@ -116,7 +116,7 @@ def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_request_that_is_cut_ends_it_quietly(share: float) -> None:
+def test_process_truncated_request(share: float) -> None:
     start = f"run({WORKERS.partition(':')[0]!r}, 'work', os.pidfd_open(os.getppid()))"
     script = f"import os; from {module.__name__} import run; {start}"
     content = pickle.dumps(pickle.dumps(("echo", list(range(1000)))))
@@ -129,7 +129,7 @@ def test_a_request_that_is_cut_ends_it_quietly(share: float) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_one_killed_is_silent_and_not_alive() -> None:
+def test_process_killed() -> None:
     with Process(WORKERS, ("hang", None), []) as process:
         assert process.receive(LONG) is not None
         os.kill(process.pid, signal.SIGKILL)
@@ -151,7 +151,7 @@ time.sleep(1000)
 
 
 @pytest.mark.parametrize("forks", [False, True])
-def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
+def test_process_ends_with_killed_parent(forks: bool) -> None:
     """Also when a process forked from the session holds the channel open."""
     args = [sys.executable, "-c", SCRIPT.format(forks=forks)]
     with child(args, stderr=None) as session:
@@ -166,7 +166,7 @@ def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
                 os.kill(forked, signal.SIGKILL)
 
 
-def test_another_server_is_started_where_it_was_killed() -> None:
+def test_process_fork_server_restarts() -> None:
     with Process(WORKERS, ("wait", None), []) as first:
         assert first.receive(LONG) == Message("waiting")
         os.kill(int(Path(f"/proc/{first.pid}/stat").read_text().split()[3]), signal.SIGKILL)
@@ -175,7 +175,7 @@ def test_another_server_is_started_where_it_was_killed() -> None:
             assert first.is_alive
 
 
-def test_each_has_the_surroundings_of_the_moment(
+def test_process_working_folder_and_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("one", "other"):
@@ -187,7 +187,7 @@ def test_each_has_the_surroundings_of_the_moment(
             assert process.receive(LONG) == Message("here", (str(folder), name))
 
 
-def test_one_that_is_dropped_ends() -> None:
+def test_process_dropped_ends() -> None:
     process = Process(WORKERS, ("wait", None), [])
     assert process.receive(LONG) is not None
     pid = process.pid

@@ -210,7 +210,9 @@ def test_cluster_incompatible_workers(
         with pytest.raises(ClusterError, match="another environment"):
             find_clashes(env, within=0.2, on=threads)
         monkeypatch.setattr(cluster, "version", lambda _: "9.9")
-        with pytest.raises(ClusterError, match=r"has 0\.1\.0 hapticdb: install 9\.9 there"):
+        with pytest.raises(
+            ClusterError, match=rf"has {hapticdb.__version__} hapticdb: install 9\.9 there"
+        ):
             find_clashes(env, within=0.2, on=threads)
 
 

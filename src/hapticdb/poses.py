@@ -127,6 +127,8 @@ def _read_array(path: str | os.PathLike[str], order: Order | None) -> NDArray[np
         found = as_floats(np.load(path, mmap_mode="c"), "poses")
     except (EOFError, OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
+        if "pickle" in str(why):  # numpy takes any other file for one
+            why = "it begins as another file"
         raise FileError(f"{path}: no .npy file of numbers: {why}") from None
     if found.shape[1:] not in {(4, 4), (7,)}:
         raise FileError(f"{path}: it has the shape {found.shape}; give (M, 4, 4), or (M, 7)")

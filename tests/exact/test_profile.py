@@ -60,7 +60,7 @@ def test_gap_on_screw_threads(hand: float, is_nut: bool) -> None:
     bolt, nut = thread(0.0, 4 * PITCH, 0.0, hand), thread(PITCH, 2 * PITCH, ROOM, hand)
     thing, tool = (bolt, nut) if is_nut else (nut, bolt)
     path, screw = screwed(tool, hand, 2.0)
-    gap, is_within, rest = gap_on_screw(thing, tool, screw, ROOM)
+    gap, is_within, rest = gap_on_screw(thing, tool, screw, ROOM, lambda: None)
     assert is_within != is_nut
     assert not rest.any()
     radius, slope = 7e-3, 2.0 * HIGH / PITCH
@@ -75,7 +75,7 @@ def test_gap_on_screw_leaves_out_what_fills_the_thread() -> None:
     bolt, nut = thread(0.0, 4 * PITCH, 0.0, 1.0), thread(PITCH, 2 * PITCH, ROOM, 1.0)
     wall = np.array([[[6e-3, 0.0, PITCH], [9e-3, 0.0, PITCH], [9e-3, 0.0, 3 * PITCH]]])
     _, screw = screwed(nut, 1.0, 2.0)
-    gap, _, rest = gap_on_screw(np.concatenate([bolt, wall]), nut, screw, ROOM)
+    gap, _, rest = gap_on_screw(np.concatenate([bolt, wall]), nut, screw, ROOM, lambda: None)
     assert np.flatnonzero(rest).tolist() == [len(bolt)]
     assert gap > 0.5 * ROOM
 
@@ -84,7 +84,7 @@ def test_gap_on_screw_of_another_pitch_is_no_proof() -> None:
     bolt, nut = thread(0.0, 4 * PITCH, 0.0, 1.0), thread(PITCH, 2 * PITCH, ROOM, 1.0)
     for pitch, hand in ((1.5 * PITCH, 1.0), (PITCH, -1.0)):
         path, screw = screwed(nut, hand, 1.0, pitch)
-        gap, _, rest = gap_on_screw(bolt, nut, screw, ROOM)
+        gap, _, rest = gap_on_screw(bolt, nut, screw, ROOM, lambda: None)
         assert least(bolt, nut, path, 30) < 1e-5
         assert gap == 0.0 or rest.any()
 
@@ -100,7 +100,7 @@ def test_gap_on_screw_bounds_samples_of_random_triangles() -> None:
         thing, tool = places[:, :, None] + size * rng.normal(size=(2, count, 3, 3))
         thing, tool = (tool, thing) if rng.random() < 0.5 else (thing, tool)
         path, screw = screwed(tool, rng.choice([-1.0, 1.0]), 1.0, rng.choice([5e-4, PITCH]))
-        gap, is_within, rest = gap_on_screw(thing, tool, screw, 3e-4)
+        gap, is_within, rest = gap_on_screw(thing, tool, screw, 3e-4, lambda: None)
         thing, tool = (thing, tool[~rest]) if is_within else (thing[~rest], tool)
         found = least(thing, tool, path, 30) if len(thing) and len(tool) else np.inf
         assert gap <= found

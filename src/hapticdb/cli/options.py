@@ -44,7 +44,7 @@ budget SIZE [256MiB]: Memory for resident cells, MiB or such as 4GiB.
 on ADDRESS: Have workers of dask.distributed do it: its scheduler, tcp://host:8786.
 layout [brick]: Index table of a new environment.
 curve [z]: Order of the keys of a new environment.
-machine FILE: A machine with joints, URDF, or MJCF (extra machines); for a sweep instead of --tool.
+machine FILE: A machine with joints, URDF, or MJCF (extra machines).
 joints CSV: Its path: a column a joint, rad or m, or a header such as 'elbow [deg]'.
 srdf FILE: Pairs of its links that are not tested.
 at POSE [the world's frame]: Where its base stands: x,y,z,qw,qx,qy,qz, millimetres, or such as

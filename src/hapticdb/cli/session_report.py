@@ -33,7 +33,7 @@ Facts = list[tuple[str, str]]
 def note_cost(n_points: int, rate: float, law: "LawName", frames_on: str = "cpu") -> None:
     """Note the cost of a tool if its frames may exceed the period on a processor."""
     seconds = 1e-9 * n_points * POINT_NS[law][n_points > IN_CACHE]
-    if seconds > 1.0 / rate and frames_on == "cpu":
+    if rate > 0.0 and seconds > 1.0 / rate and frames_on == "cpu":
         render.note(
             f"a frame with all of the tool's {n_points:,} points near a surface takes about "
             f"{1e3 * seconds:.2g} ms, and {rate:,.0f} Hz leave {1e3 / rate:.2g} ms: give fewer "

@@ -126,7 +126,7 @@ class Pair:
             return None
         pose = self.path.at(motion.parameters[screw.first : screw.first + 1])[0]
         placed = tool.corners @ pose[:3, :3].T + pose[:3, 3]
-        bound, is_within, rest = gap_on_screw(tree.corners, placed, screw, far)
+        bound, is_within, rest = gap_on_screw(tree.corners, placed, screw, far, self.check_time)
         if bound <= MEETING:
             return None
         parts = [(tree, tool, 0, screw.first), (tree, tool, screw.last, len(motion.turns))]

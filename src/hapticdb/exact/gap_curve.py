@@ -112,8 +112,9 @@ def _intervals(
     numbers[[0, -1]] = 0, len(path.parameters) - 1  # the path may begin and end with a rest
     own = mover.owns(edges)
     tool = mover.against(shape, request.cloud_radius)
-    found = _bounds(Pair(shape.tree, tool, mover.path, request.until), own, within)
-    found[:, 0] -= shape.chord + tool.chord + mover.deviation
+    errors = shape.chord + tool.chord + mover.deviation
+    found = _bounds(Pair(shape.tree, tool, mover.path, request.until), own, within + errors)
+    found[:, 0] -= errors
     found[:, 1] += mover.deviation
     # a body gets in or out of another only through a collision
     ends = np.flatnonzero(np.diff(np.concatenate([[0], found[:, 0] > 0.0, [0]])))
@@ -163,4 +164,6 @@ def _bounds(pair: Pair, edges: Floats, within: float) -> Floats:
 
 
 def _tolerance(distance: ArrayLike) -> Floats:
-    return np.maximum(TOLERANCE, SHARE * np.asarray(distance))
+    """Greatest difference of the bounds; half of a small distance, so that none becomes 0."""
+    given = np.asarray(distance)
+    return np.maximum(np.clip(0.5 * given, MEETING, TOLERANCE), SHARE * given)

@@ -5,7 +5,7 @@ r >= rho the gradients of r and of psi / sqrt(1 + (h / rho)^2) are at right angl
 the distance of two surfaces in these coordinates bounds their distance from below, at any angle.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +20,9 @@ Flags = NDArray[np.bool_]
 
 NODES = 8192
 """Nodes of a profile in a pitch."""
-FINE, ROUNDS = 1e-7, 12
-"""Error of a triangle's profile, metres, and bisections for it, at most."""
+FINE, FINE_SHARE, ROUNDS, MOST_PIECES = 1e-7, 1e-3, 12, 200_000
+"""Error of a triangle's profile, metres or a share of the greatest distance if more; bisections for
+it, and their pieces, at most."""
 EVEN, LEAST_PITCH, WIDEST = 1e-8, 1e-5, 0.5
 """Greatest error of a screw motion and its least pitch, metres; half the angle of a triangle."""
 IN_WAY, MOST_IN_WAY = 0.5, 0.1
@@ -68,7 +69,7 @@ def screw_of(motion: PathMotion, reach: float) -> Screw | None:
 
 
 def gap_on_screw(
-    thing: Floats, tool: Floats, screw: Screw, far: float
+    thing: Floats, tool: Floats, screw: Screw, far: float, check_time: Callable[[], None]
 ) -> tuple[float, bool, Flags]:
     """Distance from below of two surfaces (T, 3, 3) while the tool, at its start, makes a screw.
 
@@ -84,15 +85,17 @@ def gap_on_screw(
     # a part may have the crests of a bolt alone: neither radius shows the inner surface for certain
     for swapped in (is_within, not is_within):
         inner, outer = sides[::-1] if swapped else sides
-        gap, rest = _gap_within(inner, outer, screw, -rise if swapped else rise, far)
+        moved = -rise if swapped else rise
+        gap, rest = _gap_within(inner, outer, screw, moved, far, check_time)
         if gap > 0.0 and rest.mean() < MOST_IN_WAY:
             return gap, swapped, rest
     return 0.0, is_within, np.zeros(len(thing if not is_within else tool), dtype=np.bool_)
 
 
 def _gap_within(
-    inner: Sequence[Floats], outer: Sequence[Floats], screw: Screw, rise: float, far: float
-) -> tuple[float, Flags]:
+    inner: Sequence[Floats], outer: Sequence[Floats], screw: Screw, rise: float, far: float,
+    check_time: Callable[[], None],
+) -> tuple[float, Flags]:  # fmt: skip
     """The same for known sides: triangles, radii, least radii and heights of each."""
     triangles, r, _, z = inner
     around, _, least, heights = outer
@@ -102,23 +105,31 @@ def _gap_within(
     is_outer = least < r[is_met].max(initial=0.0) + far
     gap, rest = far, np.zeros(len(triangles), dtype=np.bool_)
     if is_met.any() and is_outer.any():
-        gap, left = _profile_gap(triangles[is_met], around[is_outer], screw, far)
+        gap, left = _profile_gap(triangles[is_met], around[is_outer], screw, far, check_time)
         rest[np.flatnonzero(is_met)[left]] = True
     return gap, rest
 
 
 def _profile_gap(
-    inner: Floats, outer: Floats, screw: Screw, far: float
+    inner: Floats, outer: Floats, screw: Screw, far: float, check_time: Callable[[], None]
 ) -> tuple[float, NDArray[np.int64]]:
     """Distance of two profiles from below, and the excluded triangles of the inner one."""
     none, period = np.zeros(0, dtype=np.int64), 2.0 * np.pi * abs(screw.slope)
-    outwards, _, error, is_wide = _profile(outer, screw, is_outer=True)
+    fine = max(FINE, FINE_SHARE * far)
+    outwards, _, error, is_wide = _profile(outer, screw, fine, is_outer=True)
     rho = float(outwards[:, :, 0].min()) - error - far
-    depth, beyond = _highest(outwards * [-1.0, 1.0], np.full(NODES, np.inf), period)
-    if is_wide.any() or beyond or rho <= 0.0:
+    check_time()
+    if is_wide.any() or rho <= 0.0:
         return 0.0, none
+    depth, beyond = _highest(outwards * [-1.0, 1.0], np.full(NODES, np.inf), period)
+    if beyond:
+        return 0.0, none
+    check_time()
     roof = -depth
-    inwards, owners, own_error, is_wide = _profile(inner, screw, is_outer=False)
+    inwards, owners, own_error, is_wide = _profile(inner, screw, fine, is_outer=False)
+    check_time()
+    if is_wide.mean() > MOST_IN_WAY:
+        return 0.0, none
     floor, in_way = _highest(inwards[~is_wide], roof - IN_WAY * far, period)
     left = np.append(owners[~is_wide][in_way], owners[is_wide])
     floor = np.maximum(floor, roof.min() - 2.0 * far)
@@ -152,11 +163,11 @@ def _least_radius(radii: Floats, angles: Floats) -> Floats:
 
 
 def _profile(
-    triangles: Floats, screw: Screw, *, is_outer: bool
+    triangles: Floats, screw: Screw, fine: float, *, is_outer: bool
 ) -> tuple[Floats, NDArray[np.int64], float, Flags]:
     """Radius and psi (.., 3, 2) of triangles, bisected until each is almost a plane triangle.
 
-    Returns the triangle of each, the greatest error in metres, and flags of those beyond `FINE`.
+    Returns the triangle of each, the greatest error in metres, and flags of those beyond `fine`.
     """
     owners = np.arange(len(triangles))
     for n_round in range(ROUNDS + 1):
@@ -166,8 +177,8 @@ def _profile(
         sag = r.max(axis=1) * (1.0 - np.cos(half)) * is_outer
         bend = np.ptp(r, axis=1) * half / (2.0 * np.maximum(r.min(axis=1), 1e-9)) + 2.0 * half**3
         errors = np.where(half < WIDEST, np.hypot(sag, screw.slope * bend), np.inf)
-        is_wide = errors > FINE
-        if not is_wide.any() or n_round == ROUNDS:
+        is_wide = errors > fine
+        if not is_wide.any() or n_round == ROUNDS or len(triangles) > MOST_PIECES:
             break
         wide, rows = triangles[is_wide], np.arange(is_wide.sum())
         first = np.abs(phi - np.roll(phi, -1, axis=1))[is_wide].argmax(axis=1)

@@ -49,7 +49,7 @@ class TargetReach(NamedTuple):
     """Reach of one target, from the better end of its axis.
 
     n_free, n_angles : numbers of placements; free : first and last angle of each run of free ones,
-    degrees; gap : the greatest proved one of these, metres, `WITHIN` at most; obstacles : first
+    degrees; gap : the greatest proved one, 0.02 m at most, 0 if it slides; obstacles : first
     hits, those of most placements first; pose (4, 4) : `world_from_tool` on the target at angle 0.
     """
 
@@ -203,8 +203,14 @@ class _Search:
         at = tool.corners @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
         self._radius = np.linalg.norm(at, axis=2).max() + tool.radius + tool.chord + WITHIN
 
-    def reach_from(self, target: Object, end: Floats) -> tuple[tuple[int, float], TargetReach]:
-        """Reach from one end; before it its rank: free placements, motion before hits."""
+    def reach_from(
+        self, target: Object, end: Floats
+    ) -> tuple[tuple[int, bool, float], TargetReach]:
+        """Reach from one end; before it its rank: free placements, if undecided, motion to hits."""
+        if time.monotonic() > self._request.until:
+            verdict, n_angles = PathVerdict.NOT_DECIDED, len(self._angles)
+            late = TargetReach(target, verdict, 0, n_angles, "", None, (), end @ self._poses[1])
+            return (0, True, 0.0), late
         apart = np.maximum(self._bounds[:, 0] - end[:3, 3], end[:3, 3] - self._bounds[:, 1])
         is_near = np.linalg.norm(apart.clip(0.0), axis=1) <= self._radius
         near = {obj.id: obj for obj, is_in in zip(self._obstacles, is_near, strict=True) if is_in}
@@ -226,9 +232,11 @@ class _Search:
         if n_free or any(one.verdict is PathVerdict.NOT_DECIDED for one in found):
             verdict = PathVerdict.REACHABLE if n_free else PathVerdict.NOT_DECIDED
         # rounded beyond the tolerance of hits: equal ends stay equal
-        return (n_free, round(length, 3)), TargetReach(
+        rank = n_free, verdict is PathVerdict.NOT_DECIDED, round(length, 3)
+        gaps = (0.0 if one.touching else one.gap.at_least for one in found if one.is_free)
+        return rank, TargetReach(
             target, verdict, n_free, len(found), _runs(self._angles, is_free),
-            max((one.gap.at_least for one in found if one.is_free), default=None),
+            max(gaps, default=None),
             tuple(near[number] for number, _ in hits.most_common()), end @ self._poses[1],
         )  # fmt: skip
 
@@ -238,6 +246,8 @@ class _Search:
         bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
         met = self._tool.box_gaps(bounds, poses) <= MEETING
         for obj, is_met in zip(objects, met, strict=True):
+            if time.monotonic() > self._request.until:  # it orders the sweeps, no more
+                is_met[:] = False
             limits = np.full(is_met.sum(), 2.0 * MEETING)
             near = self._tool.nearest(known[obj.id].tree, poses[is_met], limits, MEETING)
             is_met[is_met] = near.at_most <= MEETING

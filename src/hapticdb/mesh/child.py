@@ -41,6 +41,8 @@ _PACKED = {".3mf", ".ifc", ".laz", ".step", ".stp"}
 def main() -> None:
     """Serve one request, then exit."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
+    # parsers in other languages may abort on a damaged file
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     request = json.loads(sys.stdin.buffer.read())
     _die_with_parent(request["parent"])
     answer = os.fdopen(os.dup(1), "wb")

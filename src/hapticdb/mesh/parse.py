@@ -72,6 +72,8 @@ def cause_of(error: BaseException) -> str:
             "reading it takes more memory than a file of its size may use; "
             "if it is sound, give more: import --memory-limit, read_file(memory_limit=...)"
         )
+    if "failed to fill whole buffer" in detail:  # lazrs
+        return "it is damaged or cut short"
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, ImportError):

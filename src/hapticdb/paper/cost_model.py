@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 
 from hapticdb.store.base import Store
-from hapticdb.store.parsing import damaged
 
 
 @dataclass(frozen=True)
@@ -78,18 +77,12 @@ class CostModel:
 
     @classmethod
     def stored(cls, store: Store, machine: str) -> "CostModel | None":
-        """Model of the stored figures of a machine; None without any.
-
-        Raises `hapticdb.errors.DamagedError` for figures of other names, or blocks without rows.
-        """
-        figures = store.costs(machine)
-        if not figures:
-            return None
+        """Model of the stored figures of a machine; None without any that make a model."""
+        figures = store.costs(machine) or {}
         names = {name for name in figures if "." not in name}
         expected = {each.name for each in fields(cls)} - {"spread"}
-        if names != expected or figures["rows_per_block"] <= 0.0:
-            cause = "kept costs of other names or values; 'hapticdb info --calibrate' renews"
-            raise damaged(store.url, cause)
+        if names != expected or figures["rows_per_block"] <= 0.0 or min(figures.values()) < 0.0:
+            return None  # damage alters costs, never answers: measured anew
         return cls.from_figures(figures)
 
 

@@ -5,6 +5,7 @@ on them (`kernels.surfaces.blue_noise`), and a sort along a Z-order curve. Succe
 close in space, so a frame looks up the same brick many times in a row if it contains many points.
 """
 
+import zipfile
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -245,7 +246,9 @@ class PointShell:
         """Read a shell written by `save`; `FileError` for a missing, damaged or other file."""
         try:
             with Path(path).open("rb") as file:
-                saved = np.load(file, allow_pickle=False)
+                is_zip = zipfile.is_zipfile(file)
+                file.seek(0)
+                saved = np.load(file, allow_pickle=False) if is_zip else {}
                 if str(saved.get("format")) != FORMAT:
                     raise FileError(f"{path}: not a saved shell, or of another version")  # noqa: TRY301 - told as it is
                 return cls(

@@ -7,6 +7,7 @@ right type within its bounds here, or a DamagedError with its location.
 import contextlib
 import json
 import math
+import sys
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise, repeat
@@ -363,7 +364,7 @@ def _is_count(value: object) -> bool:
 
 
 def _is_finite(value: object) -> bool:
-    return type(value) in {int, float} and math.isfinite(cast("float", value))
+    return type(value) in {int, float} and abs(cast("float", value)) <= sys.float_info.max
 
 
 def _doubles(stored: object, count: int) -> Floats | None:

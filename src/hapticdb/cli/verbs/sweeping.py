@@ -106,7 +106,8 @@ class EnvelopeOptions:
         found = [obj for obj in env.objects() if obj.name == self.envelope]
         for obj in found:
             # a stored part is its own file
-            if obj.link != obj.name or not self.replace:
+            is_envelope = "envelope" in obj.attributes and obj.link == obj.name
+            if not (is_envelope and self.replace):
                 hint = "give another, or --replace if it is an envelope"
                 raise UsageError(f"--envelope {obj.name}: object {obj.id} has this name: {hint}")
         return [str(obj.id) for obj in found]
@@ -178,6 +179,8 @@ def sweep(
         if gaps := findings[0].found.gaps:
             for add in adds:
                 add(gaps.columns())
+            if gaps.is_stopped:
+                render.note("--gaps: the time was over, pairs are missing: give more --seconds")
         if batch is None and output.has_words:
             _show(findings[0])
         elif output.has_words:
@@ -364,7 +367,6 @@ def _show(findings: _Findings) -> None:
     searched = f"{near} near the path, {checks}"
     facts += [("looked at", searched), ("took", f"{findings.seconds:.2f} s")]
     if gaps := found.gaps:
-        late = ", the time was over: some are missing" * gaps.is_stopped
         pairs = render.counted(gaps.pairs, "pair")
-        facts.append(("curve", f"{pairs} within {length_text(gaps.within)}{late}"))
+        facts.append(("curve", f"{pairs} within {length_text(gaps.within)}"))
     render.facts(facts)

@@ -193,9 +193,9 @@ def _check_header(path: Path) -> None:
         raise UnreadableError("it is no LAS file: it does not start with 'LASF'")
     if len(header) < _HEADER:
         raise UnreadableError("it is cut short: it ends within its header")
-    size, points_at = struct.unpack_from("<HI", header, 94)
-    if not _HEADER <= size <= points_at <= n_bytes:
+    size, points_at, n_records = struct.unpack_from("<HII", header, 94)
+    if not _HEADER <= size <= points_at - 54 * n_records <= n_bytes - 54 * n_records:
         raise UnreadableError(
             f"it is damaged or cut short: its points begin at byte {points_at:,}, its header has "
-            f"{size:,} bytes, and the file {n_bytes:,}"
+            f"{size:,} bytes and {n_records:,} records, and the file {n_bytes:,} bytes"
         )

@@ -1,6 +1,7 @@
 """Draws docs/machine.png: a robot carries from a conveyor into a rack, in a hall of 4,000 parts.
 
-The path is swept first; the picture is written only if it is clear.
+The path is swept first; the picture, and the gaps along the path as .svg, are written if it is
+clear.
 """
 
 import argparse
@@ -107,8 +108,8 @@ def parts() -> list[Box]:
     return [(f"{name} {n}", edges, middle) for n, (name, edges, middle) in enumerate(found)]
 
 
-def swept(folder: Path) -> tuple[hapticdb.Machine, Floats]:
-    """Import the hall, prove the path; the machine, and poses' joint values to draw."""
+def swept(folder: Path) -> tuple[hapticdb.Machine, hapticdb.Swept]:
+    """Import the hall, and prove the path of the machine."""
     scene = trimesh.Scene()
     for name, edges, middle in parts():
         mesh = trimesh.creation.box(edges)
@@ -122,21 +123,24 @@ def swept(folder: Path) -> tuple[hapticdb.Machine, Floats]:
     with hapticdb.open(folder / "hall.db", read_only=True) as env:
         for _ in range(2):  # the first one loads kernels
             began = time.process_time()
-            found = hapticdb.sweep_machine(env, machine, PATH)
+            found = hapticdb.sweep_machine(env, machine, PATH, within=0.2)
         place = found.gap.place
         print(f"{found!r}: {len(env.objects()):,} parts, {time.process_time() - began:.2f} s of")
         print(f"processor time, nearest {place and (place.body, place.object.name)}")
     if not found.is_free:
         raise SystemExit(f"{found!r}: {[(one.body, one.object.name) for one in found.hits]}")
-    return machine, found.path.at(np.linspace(0.0, found.path.length, 200))
+    return machine, found
 
 
 def main() -> None:
     """Sweep, and draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("out", nargs="?", type=Path, default=Path("docs/machine.png"))
+    out = parser.parse_args().out
     with tempfile.TemporaryDirectory() as folder:
-        machine, values = swept(Path(folder))
+        machine, found = swept(Path(folder))
+    if found.gaps:
+        found.gaps.write(out.with_suffix(".svg"))
     canvas = Canvas(VIEW, SIZE, np.array([[0.0, 0.0], SIZE]), np.array(PAPER), 2)
     for kind, tint in GROUPS.items():
         boxes = [
@@ -152,10 +156,11 @@ def main() -> None:
             corners = surface.tree.corners @ pose[:3, :3].T + pose[:3, 3]
             canvas.fill(corners, np.array(TINTS[0]) * (1.0 - fade) + fade)
     picture = canvas.picture()
+    values = found.path.at(np.linspace(0.0, found.path.length, 200))
     tips = machine.placed(values, machine.names.index("hand")) @ (0.24, 0.0, 0.0, 1.0)
     line = [(float(x), float(y)) for x, y in canvas.project(tips[:, :3])[:, :2]]
     ImageDraw.Draw(picture).line(line, fill="#242c38", width=2)
-    picture.quantize(64).save(parser.parse_args().out, optimize=True)
+    picture.quantize(64).save(out, optimize=True)
 
 
 if __name__ == "__main__":

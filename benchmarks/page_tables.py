@@ -188,6 +188,17 @@ def fits(results: Results) -> str:
     return table([*head, "on the axis, N", "beside it, N"], rows)
 
 
+def truth(results: Results) -> str:
+    """Answers beside oracles; gaps below theirs in um."""
+    head = ("what", "oracle", "cases", "false clear", "false hit", "undecided", "gap below, um")
+    names = ("what", "oracle", "cases", "wrong_clear", "wrong_hit", "undecided")
+    rows = []
+    for row in results["truth"]["rows"]:
+        below = row["gap_below_m"]
+        rows.append([*(f"{row[name]}" for name in names), us_text(below and 1e6 * below)])
+    return table(head, rows)
+
+
 def scale_ahead(results: Results) -> str:
     """What more voxels take, by the rates of the largest environment of each engine."""
     stored = [one for one in results["scale"]["cells"] if "poses" not in one]
@@ -221,6 +232,7 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "gpu-batches": gpu_batches,
         "ways-out": removal_paths,
         "fits": fits,
+        "truth": truth,
         "scale-ahead": scale_ahead,
         "feel": lambda results: table_of(results["feel"]["cells"]),
         "walls": lambda results: walls_of(results["feel"]["cells"]),

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import page_tables
+import records
 from fits import FITS, measured
 from hapticdb import PointShell
 from hapticdb.exact.distance import Pair
@@ -140,58 +141,46 @@ def ccd(python: str, until: float) -> Iterator[tuple[str, list[bool], list[bool]
     yield "hapticdb", truth, said, time.perf_counter() - began
     if python:
         asked = json.dumps([(kind, p.tolist(), d.tolist()) for kind, p, d in queries])
+        words = [python, "-c", TIGHT]
         done = subprocess.run(
-            [python, "-c", TIGHT],
-            input=asked,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=300,
+            words, input=asked, capture_output=True, text=True, check=True, timeout=300
         )
         yield "Tight-Inclusion", truth, *json.loads(done.stdout)
 
 
 def main() -> None:
-    """Print a table: a row for each oracle."""
+    """Measure, print, and fill the table of docs/evaluation.md."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--ipctk", default="", help="a Python that has ipctk")
     chosen = parser.parse_args()
-    table: list[list[str]] = []
-    rows: dict[tuple[str, str], Callable[[float], Iterator[Case]]] = {
+    rows: list[dict[str, object]] = []
+    oracles: dict[tuple[str, str], Callable[[float], Iterator[Case]]] = {
         ("open shapes past one another", "coal"): open_shapes,
         ("M16 nut, a quarter turn", "coal"): nuts,
         ("round pegs drawn out", "nominal gap"): pegs,
     }
-    for names, cases in rows.items():
+    for (what, oracle), cases in oracles.items():
         began = time.perf_counter()
         found = list(cases(time.monotonic() + chosen.seconds))
-        wrong = [
-            sum(one.is_wrong and (one.said == said) for one in found) for said in ("clear", "hit")
-        ]
-        worst = f"{1e6 * max(one.deviation for one in found):.2f}"
-        spent = f"{time.perf_counter() - began:.1f}"
-        table.append([*names, f"{len(found)}", *map(str, wrong), "0", worst, spent])
+        row: dict[str, object] = {"what": what, "oracle": oracle, "cases": len(found)}
+        for said in ("clear", "hit"):
+            row[f"wrong_{said}"] = sum(one.is_wrong and one.said == said for one in found)
+        row["undecided"] = sum(one.said not in {"clear", "hit"} for one in found)
+        row["gap_below_m"] = max(one.deviation for one in found)
+        rows.append(row | {"s": time.perf_counter() - began})
     for name, truth, told, took in ccd(chosen.ipctk, time.monotonic() + chosen.seconds):
-        pairs = list(zip(truth, told, strict=False))
-        misses, false = (
-            sum(is_hit == hit and is_hit != one for is_hit, one in pairs) for hit in (True, False)
-        )
-        row = ["CCD of shifts", f"rational arithmetic: {name}", f"{len(pairs)}"]
-        table.append([*row, f"{misses}", f"{false}", "0", page_tables.NONE, f"{took:.1f}"])
+        pairs = [*zip(truth, told, strict=False)]
+        row = {"what": f"CCD of shifts, {name}", "oracle": "exact", "cases": len(pairs)}
+        row["wrong_clear"] = sum(is_hit and not one for is_hit, one in pairs)
+        row["wrong_hit"] = sum(one and not is_hit for is_hit, one in pairs)
+        rows.append(row | {"undecided": 0, "gap_below_m": None, "s": took})
     if not chosen.ipctk:
         print("Tight-Inclusion was not asked: --ipctk names a Python that has it")
-    head = [
-        "what",
-        "oracle",
-        "cases",
-        "wrong clear",
-        "wrong hit",
-        "not decided",
-        "gap below, um",
-        "s",
-    ]
-    print(page_tables.table(head, table))
+    found_all = records.conditions() | {"inputs": {"seconds": chosen.seconds}, "rows": rows}
+    print(page_tables.truth({"truth": found_all}))
+    records.write(Path("results"), {"truth": found_all})
+    page_tables.refill("docs/evaluation.md", Path("results"))
 
 
 if __name__ == "__main__":

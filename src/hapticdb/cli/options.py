@@ -27,8 +27,8 @@ objects WORDS...: As 'hapticdb objects' lists them.
 json: Print JSON, an object a line.
 csv FILE: Write the result as CSV to a new file; - is standard output.
 
-where WORDS: Only these objects are felt.
-exclude WORDS: Objects that are not felt.
+where WORDS: Only these objects.
+exclude WORDS: Leave these objects out.
 tool FILE: Mesh of the tool, or a shell saved as .npz.
 tool_unit: Unit of a tool whose file names no unit; metres unless given.
 path_unit [m]: Unit of the positions of the poses.

@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import UsageError
 from hapticdb.grid import corners_of
 from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH
-from hapticdb.kernels.triangles.path_distance import Search
-from hapticdb.kernels.triangles.path_motion import PathMotion
 from hapticdb.kernels.triangles.surface_distance import Nearest, nearest
 from hapticdb.pointshell.coverage import Ball
 from hapticdb.pointshell.shape import CollisionShape
@@ -63,14 +61,6 @@ class ToolSurface(CollisionShape):
             at_least=np.maximum(near.at_least - radius, 0.0),
             at_most=np.maximum(near.at_most - radius, 0.0),
             on_b=near.on_b + away,
-        )
-
-    def search(
-        self, other: TriangleBVH, motion: PathMotion, *, begin: float, best: float, fine: float
-    ) -> Search:
-        """Search for the least distance from another surface; see `kernels.triangles`."""
-        return Search(
-            other, self.tree, motion, radius=self.radius, begin=begin, best=best, fine=fine
         )
 
     def box_gaps(self, bounds: Floats, poses: Floats, more: ArrayLike = 0.0) -> Floats:

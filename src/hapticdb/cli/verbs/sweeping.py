@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from hapticdb.cli.selection import FilterWords
     from hapticdb.environment import Environment
     from hapticdb.exact.swept import Swept
+    from hapticdb.machines.machine import Machine
     from hapticdb.pointshell.shell import PointShell
 
 HELP = f"""Check whether a tool or part is free along a path.
@@ -123,12 +124,13 @@ class _Job(NamedTuple):
 
 
 class _Findings(NamedTuple):
-    """Result of a sweep with its tool; seconds : of the sweep and of making the tool."""
+    """Result of a sweep with its tool or machine; seconds : of the sweep and of making the tool."""
 
     job: _Job
     shell: "PointShell | None"
     found: "Swept"
     seconds: float
+    machine: "Machine | None" = None
 
 
 def sweep(
@@ -242,7 +244,8 @@ def _store(
     """Store the envelope of a sweep."""
     import hapticdb
 
-    moved = one.shell or hapticdb.read_machine(given.machine or "", given.srdf)
+    moved = one.shell or one.machine
+    assert moved is not None  # noqa: S101 - one of them moves
     with render.bar("making the envelope", "samples"), hapticdb.open(url) as env:
         part = hapticdb.sweep_envelope(
             moved, one.job.poses, stored.envelope or "", voxel=stored.envelope_voxel,
@@ -291,7 +294,7 @@ def _machine_swept(
         )  # fmt: skip
     for note in found.notes:
         render.note(note)
-    return _Findings(_Job(request, q, [], selection), None, found, perf_counter() - began)
+    return _Findings(_Job(request, q, [], selection), None, found, perf_counter() - began, machine)
 
 
 def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Findings:
@@ -328,7 +331,7 @@ def _show_batch(findings: Sequence[_Findings]) -> None:
     from hapticdb.exact.sweep_report import gap_text, percent
 
     rows = []
-    for job, _, found, _ in findings:
+    for job, _, found, *_ in findings:
         place = found.hits[0] if found.hits else found.gap.place
         name, at = ("", "") if place is None else (place.object.name, percent(place.fraction))
         gap = gap_text(found) if found.is_free else "-"

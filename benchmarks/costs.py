@@ -48,6 +48,7 @@ def models(sample: Path, *, real: bool) -> list[Model]:
     found = [
         Model("vintage car", data / "demo_vintage_car" / "vintage_car.glb", 1.6),
         Model("van", data / "assembly_vw_t1" / "vw_t1.glb", 2.4),
+        Model("robot", data / "robot_lekiwi" / "lekiwi.glb", 1.2),
     ]
     return [one for one in found if real and one.file.is_file()] + [
         Model("sample car", sample, 1.6)

@@ -14,7 +14,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ import hapticdb
 import many
 import page_tables
 import records
+import visits
 from awake import awake
 from hapticdb import Environment, GridOptions, ImportOptions
 from hapticdb.paper.quantiles import QuantileVector
@@ -150,6 +151,16 @@ def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
                 evaluation.measure(env)
 
 
+def visited(evaluation: Evaluation, models: Sequence[costs.Model]) -> list[Cell]:
+    """First and second visits on the models that we did not make, or on the sample car."""
+    newest = max(find_binaries(), key=lambda found: found.major)
+    frames = replace(evaluation.budget, frames=min(300, evaluation.budget.frames))
+    say = evaluation.say
+    return visits.everywhere(
+        evaluation.folder, models[:-1] or models, evaluation.bits, newest, frames, say
+    )
+
+
 def many_at_once(evaluation: Evaluation, effort: many.Effort) -> None:
     """Readers and writers on SQLite and the newest PostgreSQL, with a cache as servers have."""
     url, poses = evaluation.folder / "brick.db", evaluation.work["brick"].slide.poses
@@ -174,6 +185,7 @@ def evaluate(
         on_sqlite(evaluation)
         for binaries in find_binaries():
             on_postgres(evaluation, binaries)
+        evaluation.add({"visits": visited(evaluation, models)})
     many_at_once(evaluation, effort)
     evaluation.say("costs")
     evaluation.add({

@@ -1,51 +1,70 @@
-"""Frames of `touch` over bricks met for the first time and again, on models not made by us.
+"""Frames of `touch` over bricks met for the first time and again, on scenes not made by us.
 
-Beside them, in turns: a frame that reads its bricks (`array`), a statement for each (`points`), and
-a dense bitmap in memory. SQLite, bricks with distances, a sphere of 300 points at 300 random poses,
-whose bricks fit into memory together.
+Beside them, in turns: a statement for each point (`points`), one for the frame (`array`), and a
+dense bitmap in memory. SQLite and the newest PostgreSQL, bricks with distances, a sphere of 300
+points at random poses and along a slide, whose bricks fit into memory together.
 """
 
-import os
-import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import costs
 import hapticdb
-import page_tables
-import records
+from hapticdb.store.postgres.address import with_environment
 from paper.experiments import Budget, in_memory
 from paper.measure import Cell, in_turns
 from paper.subject import LAWS, Subject
-from paper.workload import Task, random_poses, sphere_shell
+from paper.workload import Task, random_poses, slide_poses, sphere_shell
+from places import Binaries, serving
+
+SERVER = {"max_wal_size": "4GB", "fsync": "off", "shared_buffers": "1GB"}
 
 
-def measure(url: Path, name: str, budget: Budget) -> list[Cell]:
+def measure(url: str, name: str, budget: Budget, *, beside_bitmap: bool = True) -> list[Cell]:
     """Frames on one environment."""
+    cells = []
     with hapticdb.open(url, read_only=True) as env:
         subject, shell = Subject(env, name), sphere_shell(env.grid.voxel_size)
-        task = Task("random", shell, random_poses(env, budget.frames))
-        cells = [one | {"environment": name} for one in in_memory(env, [task], budget)]
-        for law in LAWS:
-            read = [subject.alternative(task, one, law=law) for one in ("points", "array")]
-            query = subject.query()
-            first = subject.alternative(task, "auto", law=law, query=query, visit="first")
-            again = subject.alternative(task, "auto", law=law, visit="again")
-            for pose in task.poses:
-                again.frame(pose), first.frame(pose)
-            memory = query.query._memory  # noqa: SLF001 - no user drops it
-            assert memory is not None
-            first.before = memory.clear
-            cells += in_turns([*read, first, again], task.poses, limit_s=4 * budget.cell_s)
+        for task in (
+            Task("random", shell, random_poses(env, budget.frames)),
+            Task("slide", shell, slide_poses(env, shell, budget.frames)),
+        ):
+            if beside_bitmap:
+                cells += [one | {"environment": name} for one in in_memory(env, [task], budget)]
+            for law in LAWS:
+                cells += _of_law(subject, task, law, 4 * budget.cell_s)
     return cells
 
 
-if __name__ == "__main__":
+def _of_law(subject: Subject, task: Task, law: str, limit_s: float) -> list[Cell]:
+    """Frames read by statements, and the two visits."""
+    read = [subject.alternative(task, one, law=law) for one in ("points", "array")]
+    query = subject.query()
+    first = subject.alternative(task, "auto", law=law, query=query, visit="first")
+    again = subject.alternative(task, "auto", law=law, visit="again")
+    for pose in task.poses:
+        again.frame(pose), first.frame(pose)
+    memory = query.query._memory  # noqa: SLF001 - no user drops it
+    assert memory is not None
+    first.before = memory.clear
+    return in_turns([*read, first, again], task.poses, limit_s=limit_s)
+
+
+def everywhere(
+    folder: Path,
+    models: Sequence[costs.Model],
+    bits: int,
+    binaries: Binaries,
+    budget: Budget,
+    say: Callable[[str], None],
+) -> list[Cell]:
+    """Frames on every model, on SQLite and on a PostgreSQL server."""
     cells = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, file, extent in costs.models(Path(), real=True)[:-1]:  # without the sample
-            costs.imported(url := f"{folder}/{name}.db", str(file), 11, extent, distances=1)
-            cells += measure(Path(url), name, Budget(frames=300))
-    loads = ", ".join(f"{load:.1f}" for load in os.getloadavg())
-    inputs = {"first visit": "bricks in memory dropped, not pages", "load": f"{loads} at the end"}
-    records.write(records.ROOT / "results", {"visits": records.result("visits", cells, inputs)})
-    page_tables.refill("docs/evaluation.md", records.ROOT / "results")
+    with serving(folder / "visits", binaries, SERVER) as server:
+        for n, model in enumerate(models):
+            on_server = with_environment(server.conninfo(), f"visits{n}")
+            for url in (str(folder / f"visits{n}.db"), on_server):
+                say(f"visits, {model.name}, {url if url == on_server else 'SQLite'}")
+                costs.imported(url, str(model.file), bits, model.extent, distances=1)
+                cells += measure(url, model.name, budget, beside_bitmap=url != on_server)
+    return cells

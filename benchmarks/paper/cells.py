@@ -76,20 +76,3 @@ def by_strategy(cells: Iterable[Cell]) -> dict[str, Cell]:
     for cell in sorted(cells, key=typical):
         found.setdefault(cell["strategy"], cell)
     return found
-
-
-def place_of(cell: Cell, among: Iterable[Cell]) -> str:
-    """Conditions in words: engine, layout, and whatever differs among all that are listed."""
-    every = list(among)
-    said = []
-    for key in WHERE:
-        differs = len({str(other.get(key)) for other in every}) > 1
-        if cell.get(key) is not None and (differs or key in {"engine", "layout"}):
-            said.append(_spoken(key, cell[key]))
-    return ", ".join(said)
-
-
-def _spoken(key: str, value: object) -> str:
-    text = f"{value:,}" if isinstance(value, int) else named(value)
-    words = {"points": "{} points", "region": "{} density", "file": "file {}"}
-    return words.get(key, "{}").format(text)

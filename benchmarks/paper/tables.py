@@ -13,10 +13,10 @@ from paper.cells import (
     distinct,
     grouped,
     named,
-    place_of,
     typical,
 )
 
+LAWS = ("plane", "distance")
 COMPARED = ("points", "statement", "array", "maxgap", "cbgroup")
 """Strategies of the claim, in the order of its columns."""
 SHOWN = (1, 8, 32)
@@ -49,9 +49,10 @@ def claim(results: Results) -> str:
     cells = [cell for cell in cells if (cell["law"], cell["file"]) != ("distance", "cold")]
     (bitmap,) = [cell for cell in cells if cell["strategy"] == "bitmap"]
     rows = []
+    older = distinct(cells, "engine")[2:-1]  # after memory and SQLite
     for group in grouped(cells, ("engine", "layout", "law", "file")).values():
         by, one = by_strategy(group), group[0]
-        if "bitmap" not in by:
+        if "bitmap" not in by and one["engine"] not in older:
             place = f"{one['engine']}, {named(one['layout'])}, {one['law']}"
             rates = [rate_text(by.get(strategy)) for strategy in COMPARED]
             best = min(map(typical, by.values())) / typical(bitmap)
@@ -59,18 +60,55 @@ def claim(results: Results) -> str:
     return table(["random poses", *map(named, COMPARED), "best / bitmap"], rows)
 
 
+def summary(results: Results) -> str:
+    """The claim: microseconds of a frame under each law over all scenes and poses."""
+    cells = cells_of(results, "visits")
+    lines = []
+    for (engine, law), group in grouped(cells, ("engine", "law")).items():
+        if engine == "memory":
+            continue
+        us: dict[str, list[float]] = {}
+        for cell in group:
+            us.setdefault(cell.get("visit", cell["strategy"]), []).append(typical(cell))
+            if cell.get("visit") == "again":
+                ratio = typical(cell) / typical(_bitmap_beside(cells, cell))
+                us.setdefault("ratio", []).append(ratio)
+        said = {name: f"{us_text(min(all_))} to {us_text(max(all_))}" for name, all_ in us.items()}
+        lines.append(
+            f"- {engine}, law {law}: {said['first']} us at the first visit, {said['again']} from "
+            f"then on, {said['ratio']} times the bitmap; by 300 statements {said['points']}."
+        )
+    return "\n".join(lines)
+
+
+def _bitmap_beside(cells: Sequence[Cell], cell: Cell) -> Cell:
+    """The bitmap's frames at the poses of a cell."""
+    (found,) = (
+        one
+        for one in cells
+        if one["strategy"] == "bitmap"
+        and (one["environment"], one["poses"]) == (cell["environment"], cell["poses"])
+    )
+    return found
+
+
 def visits(results: Results) -> str:
-    """Frames over bricks read for the first time and again, beside frames without memory."""
+    """Microseconds of a frame's first visit and of the next ones; the bitmap in memory."""
     rows = []
-    for where, group in grouped(cells_of(results, "visits"), ("environment",)).items():
-        us = {(c["law"], c.get("visit", c["strategy"])): typical(c) for c in group}
-        for law in ("plane", "distance"):
-            again, bitmap = us[law, "again"], us["plane", "bitmap"]
-            times = [us[law, one] for one in ("points", "array", "first", "again")]
-            ratios = again / bitmap, us[law, "array"] / again, again / us["plane", "again"]
-            rows.append([f"{where[0]}, {law}", *map(us_text, times), *map(us_text, ratios)])
-    head = ["us a frame", "points", "array", "first visit", "again"]
-    return table([*head, "again / bitmap", "array / again", "again / plane"], rows)
+    cells = cells_of(results, "visits")
+    engines = distinct([cell for cell in cells if "visit" in cell], "engine")
+    for (where, poses), group in grouped(cells, ("environment", "poses")).items():
+        us = {(c["engine"], c["law"], c.get("visit", c["strategy"])): typical(c) for c in group}
+        bitmap = typical(_bitmap_beside(cells, group[0]))
+        for law in LAWS:
+            row = [f"{where}, {poses}, {law}", us_text(bitmap)]
+            for engine in engines:
+                times = [us[engine, law, one] for one in ("points", "first", "again")]
+                row += [*map(us_text, times), us_text(times[-1] / bitmap)]
+            rows.append(row)
+    beside = [f"{one}: points" for one in engines]
+    head = [text for name in beside for text in (name, "first", "again", "/ bitmap")]
+    return table(["us a frame", "bitmap", *head], rows)
 
 
 def table_1(results: Results) -> str:
@@ -125,19 +163,13 @@ def warm(results: Results) -> str:
 
 
 def grouping(results: Results) -> str:
-    """Time of CBGroup alone by the number of keys, and its fit."""
-    cells = cells_of(results, "grouping")
-    sizes = distinct(cells, "points")
-    rows = []
-    for (layout,), group in grouped(cells, ("layout",)).items():
-        by = {cell["points"]: cell for cell in group}
+    """Time of CBGroup alone by the number of keys, as fitted."""
+    said = []
+    for (layout,), group in grouped(cells_of(results, "grouping"), ("layout",)).items():
         a, b = fitted(group)
-        rows.append([
-            named(layout),
-            *(f"{us_text(by[n]['grouping_us'])} ({by[n]['keys']:,})" for n in sizes),
-            f"{a:.1f} us + {1e3 * b:.1f} ns n",
-        ])  # fmt: skip
-    return table(["keys of", *(f"{n:,} points" for n in sizes), "fit"], rows)
+        said.append(f"{a:.1f} us + {1e3 * b:.1f} ns n for the keys of {named(layout)}")
+    n = max(cell["keys"] for cell in cells_of(results, "grouping"))
+    return f"- {', '.join(said)}, measured up to n = {n:,}."
 
 
 def fitted(cells: Sequence[Cell]) -> tuple[float, float]:
@@ -184,32 +216,26 @@ def contests(cells: Sequence[Cell]) -> list[Contest]:
 
 
 def figure_9(results: Results) -> str:
-    """The best MAXGAP, the paper's, CBGroup and `array` of each contest."""
-    cells = cells_of(results, "figure9")
-    found = contests(cells)
-    rows = [
-        [
-            place_of(one.cbgroup, [other.cbgroup for other in found]),
-            f"{one.best['maxgap']:,}",
-            time_text(one.best),
-            time_text(one.cbgroup),
-            f"{one.ratio:.2f}",
-            time_text(one.array),
-        ]
-        for one in found
-    ]
-    return table(["", "best MAXGAP", "its us", "CBGroup's us", "ratio", "`array`, us"], rows)
+    """CBGroup and `array` beside the best MAXGAP."""
+    found = contests(cells_of(results, "figure9"))
+    ratios, best = [one.ratio for one in found], [one.best["maxgap"] for one in found]
+    soonest = sum(typical(one.array) < min(map(typical, one[:2])) for one in found)
+    return (
+        f"- CBGroup takes {min(ratios):.2f} to {max(ratios):.2f} times as long as the best MAXGAP, "
+        f"which is {min(best):,} to {max(best):,}; `array` is faster than both in {soonest} of "
+        f"{len(found)} cases."
+    )
 
 
 def figure_10(results: Results) -> str:
     """In how many contests CBGroup is as good as the best MAXGAP."""
     found = contests(cells_of(results, "figure10"))
     close = sum(one.ratio <= CLOSE for one in found)
-    best = sorted({one.best["maxgap"] for one in found})
+    best = [one.best["maxgap"] for one in found]
     return (
         f"- CBGroup is within 5 % of the best MAXGAP, or better, in {close} of {len(found)} "
         f"cases, at worst {max(one.ratio for one in found):.2f} times. The best MAXGAP is "
-        f"{best[0]:,} to {best[-1]:,}."
+        f"{min(best):,} to {max(best):,}."
     )
 
 
@@ -279,11 +305,23 @@ def exactness(results: Results) -> str:
     )
 
 
+def conditions(results: Results) -> str:
+    """Of the figures; and the commits of what others measured."""
+    own = results["figure9"]
+    others: dict[str, list[str]] = {}
+    for name, found in results.items():
+        if (commit := found.get("commit", own["commit"])) != own["commit"]:
+            others.setdefault(commit, []).append(name)
+    said = "; ".join(f"{', '.join(names)}: {commit}" for commit, names in others.items())
+    return facts(own, "load") + f"\n- other commits: {said}" * bool(said)
+
+
 EVALUATION: dict[str, Callable[[Results], str]] = {
+    "summary": summary,
     "claim": claim,
     "visits": visits,
     "table1": table_1,
-    "figure9": figure_9,
+    "figure9-counts": figure_9,
     "figure10-counts": figure_10,
     "grouping": grouping,
     "many": many,
@@ -294,6 +332,6 @@ EVALUATION: dict[str, Callable[[Results], str]] = {
     "warm": warm,
     "growth": growth,
     "scale-growth": scale_growth,
-    "evaluation-conditions": lambda results: facts(results["figure9"], "load"),
+    "evaluation-conditions": conditions,
 }
 """The tables of the evaluation by their names."""

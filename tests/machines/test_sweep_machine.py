@@ -1,7 +1,10 @@
 """Sweeps of machines against closed forms and dense samples."""
 
+import tracemalloc
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,7 @@ import hapticdb
 from hapticdb import Environment, Machine, read_machine, sweep_machine
 from hapticdb.errors import UsageError
 from hapticdb.exact.swept import Swept
-from hapticdb.machines.joint_path import checked_values
+from hapticdb.machines.joint_path import checked_values, joint_path, mover_of
 from hapticdb.machines.machine import motion_bounds
 from hapticdb.verdicts import PathVerdict
 
@@ -240,6 +243,53 @@ def test_sweep_machine_without_joints(env: Environment, tmp_path: Path) -> None:
 def test_sweep_machine_time_limit(env: Environment, tmp_path: Path) -> None:
     found = sweep_machine(env, machine_of(tmp_path, *EXCAVATOR), [[0.0] * 2], seconds=1e-9)
     assert (found.verdict, found.gap.at_least) == (PathVerdict.NOT_DECIDED, 0.0)
+
+
+def long_path(rows: int) -> Floats:
+    turns = np.linspace(0.0, 2.0 * np.pi, rows)
+    return np.stack([np.sin(turns), 1.0 + np.sin(3.0 * turns)], axis=1)
+
+
+@pytest.mark.parametrize("readings", [10, 40])
+def test_sweep_machine_time_limit_within_pieces(
+    env: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, readings: int
+) -> None:
+    """Each reading of the clock takes a second of it."""
+    seconds = count()
+    clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
+    monkeypatch.setattr("hapticdb.exact.distance.time", clock)
+    monkeypatch.setattr("hapticdb.exact.movers.time", clock)
+    monkeypatch.setattr("hapticdb.machines.joint_path.AT_ONCE", 256)
+    machine = machine_of(tmp_path, *EXCAVATOR)
+    found = sweep_machine(env, machine, long_path(4000), seconds=float(readings))
+    assert found.verdict is PathVerdict.NOT_DECIDED
+    assert next(seconds) <= readings + 3
+
+
+def test_sweep_machine_in_pieces_has_the_same_answer(
+    env: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine, q = machine_of(tmp_path, *EXCAVATOR), long_path(300)
+    whole = sweep_machine(env, machine, q)
+    monkeypatch.setattr("hapticdb.machines.joint_path.AT_ONCE", 64)
+    monkeypatch.setattr("hapticdb.machines.machine_sweep.AT_ONCE", 64)
+    pieces = sweep_machine(env, machine, q)
+    assert np.allclose(pieces.path.parameters, whole.path.parameters, rtol=1e-12)
+    assert pieces.gap[:2] == pytest.approx(whole.gap[:2], rel=1e-9)
+
+
+def test_mover_of_memory_in_proportion(tmp_path: Path) -> None:
+    machine, link = machine_of(tmp_path, *EXCAVATOR), (0, 2)
+    path, steps = joint_path(machine, checked_values(machine, long_path(40_000)), [link])
+    tracemalloc.start()
+    try:
+        mover = mover_of(machine, path, *link, steps[link], None, np.eye(4))
+        left, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    n_poses = len(mover.path.parameters)
+    assert left < 170 * n_poses  # its path has 17 numbers a pose
+    assert peak < 1000 * n_poses
 
 
 def random_machine(folder: Path, rng: np.random.Generator) -> Machine:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.store.base import Object
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 COARSE, FINE = 9e-6, 1e-6
 """Tolerances of a least distance, metres, and per mille of it if more: coarse always, fine after a
@@ -40,6 +41,14 @@ time limit is overrun by more."""
 
 class OverTimeError(Exception):
     """The time of a sweep is over."""
+
+
+def in_time(given: Iterable[T], until: float) -> Iterator[T]:
+    """Pass on what is given; OverTimeError once the time, `time.monotonic`, is over."""
+    for one in given:
+        if time.monotonic() > until:
+            raise OverTimeError
+        yield one
 
 
 class Least(NamedTuple):

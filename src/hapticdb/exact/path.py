@@ -1,6 +1,7 @@
 """Paths of rigid motion, parameterised by an upper bound on the motion of any tool point."""
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ MUCH, HALF_TURN = 170.0, 179.99
 """Degrees between two poses: from the first on a doubtful turn, beyond the second half a turn."""
 AT_ONCE = 64
 """Segments of a batch of turns. Larger: more memory."""
+NO_POSES = np.empty((0, 4, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ class ToolPath(SampledPath):
         Path parameter at each given pose, metres: no place of the tool moves more than the
         difference from one to the next.
     poses : (M, 4, 4)
-        As given, `world_from_tool`.
+        As given, `world_from_tool`; none of a machine's link.
     motion : PathMotion
         The same for kernels.
     """
@@ -80,24 +82,24 @@ class ToolPath(SampledPath):
         numbers.
         """
         given = checked_poses(poses)
-        quaternions = quaternion_of(given[:, :3, :3])
-        centers = given[:, :3, :3] @ center + given[:, :3, 3]
-        turns = _turns_between(quaternions)
-        with np.errstate(over="ignore"):
-            motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-        rotations = rotation_of(quaternions)
-        motion += _turned(corners - center, turns, rotations[:-1])
+        return cls.joined([given], corners, center, given)
+
+    @classmethod
+    def joined(
+        cls, pieces: Iterable[Floats], corners: Floats, center: Floats, given: Floats = NO_POSES
+    ) -> "ToolPath":
+        """The same through pieces of a path, each from the last pose of the one before."""
+        parts = [_steps(piece, corners, center, is_later=n > 0) for n, piece in enumerate(pieces)]
+        # pieces are freed array by array: the peak is a third above the result
+        columns = [[*column] for column in zip(*parts, strict=True)]
+        del parts
+        turns, rotations, centers, motion = (np.concatenate(columns.pop()) for _ in range(4))
         parameters = np.concatenate([[0.0], np.cumsum(motion)])
         if not np.isfinite(parameters[-1]):
             raise UsageError("the path is longer than numbers go: check its unit")
-        # two poses at least
-        again = [*range(len(parameters))] if len(parameters) > 1 else [0, 0]
-        moved = (
-            parameters[again],
-            centers[again],
-            rotations[again],
-            turns if len(turns) else np.zeros((1, 3)),
-        )
+        moved = [parameters, centers, rotations, turns]
+        if len(parameters) == 1:  # two poses at least
+            moved = [*(np.repeat(one, 2, axis=0) for one in moved[:3]), np.zeros((1, 3))]
         return cls(parameters, given, PathMotion(*map(np.ascontiguousarray, (*moved, center))))
 
     def checked(self) -> "ToolPath":
@@ -120,6 +122,19 @@ class ToolPath(SampledPath):
         out = np.tile(np.eye(4), (len(parameters), 1, 1))
         poses_kernel(self.motion, self.segments(parameters), parameters, out)
         return out
+
+
+def _steps(
+    poses: Floats, corners: Floats, center: Floats, *, is_later: bool
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Lengths, centres, rotations and turns; is_later : without those of the first pose."""
+    quaternions = quaternion_of(poses[:, :3, :3])
+    centers, turns = poses[:, :3, :3] @ center + poses[:, :3, 3], _turns_between(quaternions)
+    with np.errstate(over="ignore"):
+        motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    rotations = rotation_of(quaternions)
+    motion += _turned(corners - center, turns, rotations[:-1])
+    return motion, centers[is_later:], rotations[is_later:], turns
 
 
 def checked_poses(poses: ArrayLike) -> Floats:

@@ -93,8 +93,8 @@ def _movers(
     if isinstance(tool, Machine):
         base = np.eye(4) if at is None else checked_poses(np.asarray(at)[None])[0]
         links = [(0, link) for link in tool.surfaces]
-        joints, bounds = joint_path(tool, checked_values(tool, path), links)
-        return [mover_of(tool, joints, *link, bounds[link], None, base) for link in links]
+        joints, steps = joint_path(tool, checked_values(tool, path), links)
+        return [mover_of(tool, joints, *link, steps[link], None, base) for link in links]
     body = ToolSurface(tool)
     return [Mover(body, ToolPath.of(path, body.corners, center_of(body, about)).checked())]
 

@@ -8,15 +8,18 @@ on either motion. A sweep takes that off its gaps; a collision begins at five ti
 
 import csv
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import FileError, UsageError
+from hapticdb.exact.distance import in_time
 from hapticdb.exact.movers import Mover
-from hapticdb.exact.path import SampledPath, ToolPath
+from hapticdb.exact.path import SampledPath, ToolPath, checked_poses
 from hapticdb.machines.machine import HINGE, Bounds, Machine, motion_bounds
 from hapticdb.poses import as_floats
 from hapticdb.units import UNITS
@@ -28,11 +31,20 @@ DEVIATION = 2e-6
 MOST_TURN = 0.5
 """Greatest turn of a link between two poses, radians."""
 MOST_POSES = 1_000_000
-"""Poses of a link's path. Larger: more memory, 0.1 GiB each million."""
+"""Poses of a link's path. Larger: more memory, 0.14 GiB each million."""
+AT_ONCE = 1 << 14
+"""Rows or poses between two readings of the clock: a tenth of a second, 0.1 GiB."""
 MOST_VALUE = 1e6
 """Greatest value of a joint, rad or m. Larger: rounding has a part in the deviation."""
 _NAME = re.compile(r"(.*?)\s*(?:\[\s*(\S+)\s*\])?")
 _DEGREE = np.pi / 180.0
+
+
+class RowSteps(NamedTuple):
+    """Of a link's motion between two rows, (rows - 1,) each: metres of its fastest place, parts."""
+
+    speed: Floats
+    counts: NDArray[np.int32]
 
 
 def read_joints(path: str, machine: Machine) -> Floats:
@@ -125,53 +137,69 @@ def beyond_limits(machine: Machine, values: Floats) -> Iterable[str]:
 
 
 def joint_path(
-    machine: Machine, values: Floats, pairs: Iterable[tuple[int, int]]
-) -> tuple[SampledPath, dict[tuple[int, int], Bounds]]:
+    machine: Machine, values: Floats, pairs: Sequence[tuple[int, int]], until: float = np.inf
+) -> tuple[SampledPath, dict[tuple[int, int], RowSteps]]:
     """Path over rows, its parameter the greatest motion of any link in the frame of another.
 
-    Beside it the bounds of each pair: a link in the frame of the first.
+    Beside it the steps of each pair: a link in the frame of the first. until : end,
+    `time.monotonic`, by OverTimeError.
     """
-    placed = machine.all_placed(values)
-    with np.errstate(over="ignore", invalid="ignore"):
-        bounds = {pair: motion_bounds(machine, values, *pair, placed) for pair in pairs}
+    pieces: list[list[RowSteps]] = [[] for _ in pairs]
+    for first in range(0, len(values) - 1, AT_ONCE):
+        some = values[first : first + AT_ONCE + 1]
+        placed = machine.all_placed(some)
+        for pair, found in in_time(zip(pairs, pieces, strict=True), until):
+            with np.errstate(over="ignore", invalid="ignore"):
+                found.append(_steps(motion_bounds(machine, some, *pair, placed)))
+    steps = {
+        pair: RowSteps(*map(np.concatenate, zip(*found, strict=True)))
+        for pair, found in zip(pairs, pieces, strict=True)
+    }
     # the fastest pair of links: a bound for all, so one parameter orders every hit
-    parameters = np.concatenate(
-        [[0.0], np.cumsum(np.max([one.speed for one in bounds.values()], axis=0))]
-    )
+    fastest = reduce(np.maximum, (one.speed for one in steps.values()))
+    parameters = np.concatenate([[0.0], np.cumsum(fastest)])
     if not np.isfinite(parameters[-1]):
         raise UsageError("the joint path is longer than numbers go: check its units")
-    return SampledPath(parameters, values), bounds
+    return SampledPath(parameters, values), steps
+
+
+def _steps(bounds: Bounds) -> RowSteps:
+    # chord error h^2 / 8 times the second derivative, solved for the number of parts
+    counts = np.maximum(np.sqrt(bounds.bend / (8.0 * DEVIATION)), bounds.turn / MOST_TURN)
+    # fmin, so NaN and infinity are too many, too
+    counts = np.fmin(np.maximum(np.ceil(counts), 1.0), MOST_POSES + 1)
+    return RowSteps(bounds.speed, counts.astype(np.int32))
 
 
 def mover_of(
-    machine: Machine, path: SampledPath, first: int, last: int, bounds: Bounds,
-    frame: Callable[[float], Floats] | None, base: Floats,
+    machine: Machine, path: SampledPath, first: int, last: int, steps: RowSteps,
+    frame: Callable[[float], Floats] | None, base: Floats, until: float = np.inf,
 ) -> Mover:  # fmt: skip
-    """A link on its path in the frame of another one, with its bounds there.
+    """A link on its path in the frame of another one, with its steps there.
 
-    base (4, 4) : `world_from_base`.
+    base (4, 4) : `world_from_base`; until : as of `joint_path`.
     """
-    values, surface = path.poses, machine.surfaces[last]
-    # chord error h^2 / 8 times the second derivative, solved for the number of parts
-    with np.errstate(over="ignore", invalid="ignore"):
-        counts = np.maximum(np.sqrt(bounds.bend / (8.0 * DEVIATION)), bounds.turn / MOST_TURN)
-    counts = np.maximum(np.ceil(counts), 1.0)
-    # negated as above: the sum overflows with the bounds
-    if not counts.sum() <= MOST_POSES:
+    counts, surface = steps.counts, machine.surfaces[last]
+    if counts.sum() > MOST_POSES:
         raise UsageError(
             f"link {machine.names[last]} moves too far for one sweep: divide the joint path"
         )
-    rows = np.arange(len(counts))
-    knots = np.concatenate(
-        [row + np.arange(n) / n for row, n in zip(rows, counts.astype(int), strict=True)]
-        + [[len(rows)]]
-    )
-    own = np.stack([np.interp(knots, np.arange(len(values)), one) for one in values.T], axis=1)
-    # relative motion: the other link stands still, so it can play the part of an object
-    before = base if frame is None else np.linalg.inv(machine.placed(own, first))
-    poses = before @ machine.placed(own, last)
-    # the inverse leaves rounding in the last row, and `checked_poses` compares exactly
-    poses[:, 3] = 0.0, 0.0, 0.0, 1.0
-    motion = ToolPath.of(poses, surface.corners, surface.corners.mean(axis=0))
-    parameters = np.interp(knots, np.arange(len(values)), path.parameters)
+    rows, columns = np.arange(len(counts) + 1.0), np.ascontiguousarray(path.poses.T)
+    begins = np.repeat(np.cumsum(counts) - counts, counts)
+    parts = (np.arange(len(begins)) - begins) / np.repeat(counts, counts)
+    knots = np.append(np.repeat(rows[:-1], counts) + parts, rows[-1])
+
+    def placed(n: int) -> Floats:
+        some = knots[n : n + AT_ONCE + 1]
+        own = np.stack([np.interp(some, rows, one) for one in columns], axis=1)
+        # relative motion: the other link stands still, so it can play the part of an object
+        before = base if frame is None else np.linalg.inv(machine.placed(own, first))
+        poses = before @ machine.placed(own, last)
+        # the inverse leaves rounding in the last row, and `checked_poses` compares exactly
+        poses[:, 3] = 0.0, 0.0, 0.0, 1.0
+        return checked_poses(poses)
+
+    pieces = map(placed, in_time(range(0, len(knots) - 1, AT_ONCE), until))
+    motion = ToolPath.joined(pieces, surface.corners, surface.corners.mean(axis=0))
+    parameters = np.interp(knots, rows, path.parameters)
     return Mover(surface, motion, machine.names[last], parameters, frame, DEVIATION)

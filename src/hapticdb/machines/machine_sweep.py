@@ -1,36 +1,35 @@
 """Sweeps of machines along joint paths: links against objects, and links against links."""
 
-import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
-from hapticdb.exact.distance import OverTimeError
+from hapticdb.exact.distance import OverTimeError, in_time
 from hapticdb.exact.movers import LinkPair, Mover, SweepRequest
 from hapticdb.exact.path import SampledPath, checked_poses
 from hapticdb.exact.separation import CONTACT
 from hapticdb.exact.sweep import swept_along
 from hapticdb.exact.swept import Swept
 from hapticdb.machines.joint_path import (
+    AT_ONCE,
     DEVIATION,
+    RowSteps,
     beyond_limits,
     checked_values,
     joint_path,
     mover_of,
 )
-from hapticdb.machines.machine import Bounds, Machine, pairs_of
+from hapticdb.machines.machine import Machine, pairs_of
 from hapticdb.machines.reader import read_machine
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 
 Floats = NDArray[np.float64]
-T = TypeVar("T")
 
 SAMPLES = 8
 """Rows at which the links' distances are measured: the nearest pair is swept first."""
@@ -103,24 +102,15 @@ def _prepared(
     """Path, movers for the scene, pairs of links with the nearest ones first, and notes."""
     pairs, notes = _tested(machine, request)
     shown = machine.all_placed(values[np.linspace(0, len(values) - 1, SAMPLES).astype(np.int64)])
-    gaps = {pair: _gap(machine, pair, shown, np.inf) for pair in _in_time(pairs, request)}
+    gaps = {pair: _gap(machine, pair, shown, np.inf) for pair in in_time(pairs, request.until)}
     pairs.sort(key=gaps.__getitem__)  # bounds the later ones
     scene = [(0, link) for link in machine.surfaces]  # link 0 is the base: it stands still
-    path, bounds = joint_path(machine, values, _in_time([*pairs, *scene], request))
+    path, steps = joint_path(machine, values, [*pairs, *scene], request.until)
     movers = [
-        mover_of(machine, path, *link, bounds[link], None, base)
-        for link in _in_time(scene, request)
+        mover_of(machine, path, *link, steps[link], None, base, request.until) for link in scene
     ]
-    links = _link_pairs(machine, path, _in_time(pairs, request), bounds, base)
+    links = _link_pairs(machine, path, pairs, steps, base, request.until)
     return path, movers, list(links), notes
-
-
-def _in_time(pairs: Iterable[T], request: SweepRequest) -> Iterator[T]:
-    """Pass on what is given; OverTimeError once the time is over."""
-    for pair in pairs:
-        if time.monotonic() > request.until:
-            raise OverTimeError
-        yield pair
 
 
 def _tested(machine: Machine, request: SweepRequest) -> tuple[list[tuple[int, int]], list[str]]:
@@ -133,7 +123,7 @@ def _tested(machine: Machine, request: SweepRequest) -> tuple[list[tuple[int, in
     tested: list[tuple[int, int]] = []
     touching: list[tuple[int, int]] = []
     contact = request.contact
-    for a, b in _in_time(pairs, request):
+    for a, b in in_time(pairs, request.until):
         # no list in the file: neighbours in contact at zero are taken for joined, not for clashing
         is_touching = _gap(machine, (a, b), zero, 2.0 * contact) <= contact
         (touching if is_touching else tested).append((a, b))
@@ -155,25 +145,29 @@ def _gap(
 
 
 def _link_pairs(
-    machine: Machine, path: SampledPath, pairs: Iterable[tuple[int, int]],
-    bounds: Mapping[tuple[int, int], Bounds], base: Floats,
+    machine: Machine, path: SampledPath, pairs: Sequence[tuple[int, int]],
+    steps: Mapping[tuple[int, int], RowSteps], base: Floats, until: float,
 ) -> Iterator[LinkPair]:  # fmt: skip
     rows = len(path.poses) - 1
     parts = max(STRETCHES // rows, 1)
-    middles = (np.arange(rows * parts) + 0.5) / parts
-    given = np.arange(rows + 1)
-    values = np.stack([np.interp(middles, given, one) for one in path.poses.T], axis=1)
-    placed = machine.all_placed(values)
+    given, least = np.arange(rows + 1), dict.fromkeys(pairs, np.inf)
+    for first in range(0, rows, AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        middles = first + (np.arange(parts * len(given[:-1][some])) + 0.5) / parts
+        values = np.stack([np.interp(middles, given, one) for one in path.poses.T], axis=1)
+        placed = machine.all_placed(values)
+        for a, b in in_time(pairs, until):
+            # no place moves farther from the middle of a stretch: boxes there bound the gap
+            reach = np.repeat(steps[a, b].speed[some] / (2 * parts), parts)
+            poses, box = np.linalg.inv(placed[a]) @ placed[b], machine.surfaces[a].box
+            gaps = machine.surfaces[b].box_gaps(box[None], poses, reach)
+            least[a, b] = min(least[a, b], float(gaps.min()))
     for a, b in pairs:
 
         def frame(parameter: float, link: int = a) -> Floats:  # the default binds `a` now
             return np.asarray(base @ machine.placed(path.at([parameter]), link)[0])
 
         shape = machine.surfaces[a]
-        # no place moves farther from the middle of a stretch: boxes there bound the gap
-        reach = np.repeat(bounds[a, b].speed / (2 * parts), parts)
-        poses = np.linalg.inv(placed[a]) @ placed[b]
-        gaps = machine.surfaces[b].box_gaps(shape.box[None], poses, reach)
-        mover = partial(mover_of, machine, path, a, b, bounds[a, b], frame, base)
+        mover = partial(mover_of, machine, path, a, b, steps[a, b], frame, base, until)
         thing = Object(machine.names[a], machine.file, "", np.eye(4), 0, shape.box)
-        yield LinkPair(float(gaps.min()) - shape.chord, mover, thing, shape)
+        yield LinkPair(least[a, b] - shape.chord, mover, thing, shape)

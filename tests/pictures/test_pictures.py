@@ -52,6 +52,13 @@ def test_canvas_brighter_towards_light() -> None:
     assert brightness[0] > brightness[1]
 
 
+def test_canvas_fill_nothing_in_view() -> None:
+    drawn = canvas()
+    drawn.fill(plate(0.5) + np.array([100.0, 0.0, 0.0]), np.ones(3))
+    drawn.fill(np.empty((0, 3, 3)), np.ones(3))
+    assert np.asarray(drawn.picture()).max() == 0
+
+
 def test_canvas_near_clipping() -> None:
     drawn = canvas()
     drawn.fill(plate(0.5) + 10.0 * turned((0.50, 0.76, 0.44), 2), np.ones(3))

@@ -65,6 +65,8 @@ class Canvas:
         low = np.maximum(np.ceil(placed[..., :2].min(axis=1) - 0.5), 0.0).astype(np.int64)
         sides = np.floor(placed[..., :2].max(axis=1) + 0.5).clip(max=self._depths.shape[::-1]) - low
         seen = np.flatnonzero((sides[:, 0] > 0.0) & (sides[:, 1] > 0.0))
+        if not len(seen):
+            return
         # triangles of about the same width and height are drawn together
         codes = np.ceil(np.log(sides[seen]) / np.log(GROWTH)).astype(np.int64) @ (64, 1)
         order = np.argsort(codes)

@@ -47,8 +47,8 @@ class PathVerdict(StrEnum):
     line: str
 
     HITS = "hits", 1, "a surface is met, or the tool starts inside an object"
-    NO_PATH = "no way found", 1, "no proof that there is none"
-    NO_ORDER = "no order found", 1, "no proof that there is none"
+    NO_PATH = "no path found", 1, "one may exist"
+    NO_ORDER = "no order found", 1, "one may exist"
     NOT_REACHABLE = "not reachable", 1, "each placement of the tool is blocked"
     NOT_DECIDED = "not decided", 3, "the time was over, or a chord error is too large"
     OVERLAPS = "overlaps", 4, "nothing else is hit, but it overlaps others at the start"

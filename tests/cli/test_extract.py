@@ -57,7 +57,7 @@ def test_extract_blockers_table(run: Run, tmp_path: Path) -> None:
     code, out, err = run("extract", url, "block", "--motions", 0, "--path", "out.csv")
     assert (code, err) == (1, "")
     first, heading, _, row, *_ = [line for line in out.splitlines() if line]
-    assert first.startswith("no way found in ")
+    assert first.startswith("no path found in ")
     assert "cage blocks" in first
     assert heading.split() == ["id", "in", "the", "way", "of", "pulls"]
     assert row.split()[1] == "cage"

@@ -90,6 +90,6 @@ def test_extract_pull_through_contact_refused(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_extract_block_on_floor_of_closed_box(tmp_path: Path) -> None:
     found = found_in(grounded(tmp_path), "block", motions=200)
-    assert (found.verdict, found.is_planned) == ("no way found", True)
+    assert (found.verdict, found.is_planned) == ("no path found", True)
     assert [one.object.name for one in found.blockers] == ["cage"]
     assert 0 < found.motions <= 2 * 200

@@ -62,7 +62,7 @@ def test_disassemble_chain_links_no_order(tmp_path: Path) -> None:
     assert [one.object.name for one in found.blockers] == ["right"]
     assert [[obj.name for obj in one.parts] for one in found.failed] == [["left"], ["right"]]
     assert disassembly_line(found) == "no order found in 2 searches: blocked by right"
-    assert failed_line(found.failed[1]) == "no way found: blocked by left"
+    assert failed_line(found.failed[1]) == "no path found: blocked by left"
 
 
 def test_disassemble_free_part_no_steps(tmp_path: Path) -> None:

@@ -159,7 +159,7 @@ def test_extract_same_seed_same_path(tmp_path: Path) -> None:
 @pytest.mark.parametrize("to", [None, shifted(np.array([0.2, 0.0, 0.0]))])
 def test_extract_enclosed_names_blocker(tmp_path: Path, to: Any) -> None:  # noqa: ANN401
     found = found_in(enclosed(tmp_path), "block", motions=60, to=to)
-    assert (found.verdict, found.path, found.is_planned) == ("no way found", None, True)
+    assert (found.verdict, found.path, found.is_planned) == ("no path found", None, True)
     assert [one.object.name for one in found.blockers] == ["cage"]
     assert found.blockers[0].pulls == found.pulls  # with the straight way to a pose
     assert "cage blocks" in extraction_line(found)
@@ -171,7 +171,7 @@ def test_extract_time_limit_of_planner(tmp_path: Path) -> None:
     found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=1.0)
     assert found.path is None
     assert (found.verdict, found.verdict.exit_status) == ("not decided", 3)
-    assert extraction_line(found).startswith("not decided: the time was over; no way found in")
+    assert extraction_line(found).startswith("not decided: the time was over; no path found in")
     assert "give more --seconds" in extraction_line(found)
 
 
@@ -197,7 +197,7 @@ def test_extract_missing_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     url = enclosed(tmp_path)
     with pytest.raises(MissingExtraError, match=r"cage is in the way.*pip install .*ompl"):
         found_in(url, "block")
-    assert found_in(url, "block", motions=0).verdict == "no way found"
+    assert found_in(url, "block", motions=0).verdict == "no path found"
 
 
 def test_extract_planner_process_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

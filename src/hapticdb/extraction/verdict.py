@@ -43,7 +43,7 @@ def _no_path(found: Extraction) -> str:
     tried = f"{pulls} and {found.motions:,} motions" if found.is_planned else pulls
     if found.is_planned and not found.motions:
         tried = f"{pulls}, none of which gets free of what is near"
-    said = f"no way found in {tried}"
+    said = f"no path found in {tried}"
     if found.is_out_of_time:
         said = f"not decided: the time was over; {said}; give more --seconds"
     if not found.blockers:

@@ -323,7 +323,7 @@ def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:
     keys = _int64s(bounds)
     if keys is None or len(keys) < 2 or (np.diff(keys) < 0).any() or not _is_count(n_rows):
         raise damaged(
-            url, "kept statistics that are no ascending keys; 'hapticdb info --calibrate' renews"
+            url, "stored statistics that are no ascending keys; 'hapticdb info --calibrate' renews"
         )
     return Histogram(keys, cast("int", n_rows), "kept")
 
@@ -332,7 +332,7 @@ def figures_of(url: str, text: object) -> Mapping[str, float]:
     """Parse the stored figures of a cost model: finite numbers by name."""
     figures = _json_of(text)
     if figures is None or not all(_is_finite(value) for value in figures.values()):
-        raise damaged(url, "kept costs that are no numbers; 'hapticdb info --calibrate' renews")
+        raise damaged(url, "stored costs that are no numbers; 'hapticdb info --calibrate' renews")
     return cast("Mapping[str, float]", figures)
 
 
@@ -344,12 +344,12 @@ def findings_of_stored(
         with contextlib.suppress(DamagedError):
             histogram_of(url, *row)
             continue
-        yield "kept statistics are no ascending keys; 'hapticdb info --calibrate' renews them"
+        yield "stored statistics are no ascending keys; 'hapticdb info --calibrate' renews them"
     for row in costs:
         with contextlib.suppress(DamagedError):
             figures_of(url, *row)
             continue
-        yield "kept costs are no numbers; 'hapticdb info --calibrate' renews them"
+        yield "stored costs are no numbers; 'hapticdb info --calibrate' renews them"
 
 
 def number_of(url: str, value: object, what: str) -> int:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 import hapticdb
 from contact_scenes import MM, box, frame_of, imported, moved, placed, quad, ring, rod, shell_of
 from hapticdb import Environment, Reached
-from hapticdb.errors import ObjectNotFoundError, UsageError
+from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.poses import rotation_of
+from hapticdb.store.base import Store
 from moving_boxes import Boxes, apart
 
 Floats = NDArray[np.float64]
@@ -164,6 +165,32 @@ def test_reach_time_limit_undecided(env: Environment) -> None:
     found = reached(env, "sheet", "wide", seconds=1e-9)
     assert [one.verdict for one in found.targets] == ["not decided"]
     assert found.columns()["verdict"] == ["not decided"]
+
+
+def test_reach_checks_all_axes_first(env: Environment) -> None:
+    told: list[tuple[int, int]] = []
+    with pytest.raises(UsageError, match=r"\(slab\) has no single axis"):
+        hapticdb.reach(
+            env, ["bolt", "slab"], TOOL, where=["sheet"],
+            progress=lambda *now: told.append(now),
+        )  # fmt: skip
+    assert told == []
+
+
+def test_reach_lost_connection_once_more(env: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
+    expected, read = reached(env, "sheet"), type(env.store).surfaces
+    lost: list[list[str]] = []
+
+    def lose_once(store: Store, digests: list[str]) -> dict[str, bytes]:
+        if not lost:
+            lost.append(digests)
+            raise ConnectionLostError("the server went away: run the same again")
+        return read(store, digests)
+
+    monkeypatch.setattr(type(env.store), "surfaces", lose_once)
+    found = reached(env, "sheet")
+    assert lost
+    assert [one.free for one in found.targets] == [one.free for one in expected.targets]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from hapticdb.errors import UsageError
 from hapticdb.exact.movers import Mover, SweepRequest, shapes_of
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import CONTACT
-from hapticdb.exact.sweep import PathSweep, center_of
+from hapticdb.exact.sweep import PathSweep, center_of, in_snapshot
 from hapticdb.exact.swept import Swept
 from hapticdb.kernels.surfaces.triangle_bvh import normals_of
 from hapticdb.kernels.triangles.path_distance import MEETING
@@ -118,19 +118,24 @@ def reach(
     request = request.begun(WITHIN, seconds)._replace(known={})
     if not 0.1 <= step <= 360.0:
         raise UsageError(f"a step of {step} degrees: give 0.1 to 360")
-    center, found = center_of(surface, np.zeros(3) if about is None else about), []
+    center = center_of(surface, np.zeros(3) if about is None else about)
     poses = _motion(center, approach, offset, lift, turn)
     angles = np.arange(0.0, 360.0 - 1e-6, step)  # less by rounding: 360 is 0 again
-    with env.store.snapshot():
-        chosen, obstacles = find_objects(env, targets), env.select(where, exclude)
-        search = _Search(env, surface, center, poses, angles, request, obstacles)
-        for obj, shape in shapes_of(env.store, chosen):
-            ends = [search.reach_from(obj, end) for end in _ends(obj, shape, axis)]
+
+    def reached() -> Reached:
+        chosen, found = find_objects(env, targets), []
+        search = _Search(env, surface, center, poses, angles, request, env.select(where, exclude))
+        # all axes before the first sweep: a target without one ends no long search
+        each = [(obj, [*_ends(obj, shape, axis)]) for obj, shape in shapes_of(env.store, chosen)]
+        for obj, ends in each:
             # of ends without a free placement, the one from which the tool gets farther
-            found.append(max(ends, key=itemgetter(0))[1])
+            ranked = [search.reach_from(obj, end) for end in ends]
+            found.append(max(ranked, key=itemgetter(0))[1])
             if progress is not None:
                 progress(len(found), len(chosen))
         return Reached(tuple(found), env.store.revision(), time.monotonic() - began)
+
+    return in_snapshot(env, reached)
 
 
 def _motion(center: Floats, approach: str, offset: float, lift: float, turn: float) -> Floats:

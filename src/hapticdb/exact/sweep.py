@@ -4,9 +4,9 @@ Broad phase: the objects' boxes, never too few of them. Narrow phase: their surf
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +33,7 @@ BEYOND = 4.0
 """Chord errors beyond a collision for the proof of an overlap of the true surfaces."""
 
 Floats = NDArray[np.float64]
+T = TypeVar("T")
 
 
 def sweep(
@@ -102,16 +103,18 @@ def swept_along(
     where: Words, exclude: Words, pairs: Sequence[LinkPair] = (),
 ) -> Swept:  # fmt: skip
     """Sweep rigid bodies, and pairs of them, along one path."""
+    return in_snapshot(
+        env,
+        lambda: PathSweep(env, path, movers, request).swept(env.select(where, exclude), pairs),
+    )
 
-    def swept() -> Swept:
-        with env.store.snapshot():
-            objects = env.select(where, exclude)
-            return PathSweep(env, path, movers, request).swept(objects, pairs)
 
-    # once more from the start: the new connection has another snapshot
-    with suppress(ConnectionLostError):
-        return swept()
-    return swept()
+def in_snapshot(env: Environment, answer: Callable[[], T]) -> T:
+    """Answer in one snapshot; once more from the start if the connection is lost."""
+    with suppress(ConnectionLostError), env.store.snapshot():
+        return answer()
+    with env.store.snapshot():  # the new connection has another one
+        return answer()
 
 
 def center_of(tool: ToolSurface, about: ArrayLike | None) -> Floats:

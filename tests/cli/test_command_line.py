@@ -7,6 +7,7 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import hapticdb
@@ -14,6 +15,7 @@ import step_files
 from children import child, finished
 from command_line import Run, boxes, command, poses, refused, succeeded
 from hapticdb import cli
+from hapticdb.mesh import Part
 from hapticdb.store import connect
 
 VERBS = [verb.__name__.rstrip("_") for verb in cli.VERBS if verb not in cli.HIDDEN]
@@ -184,6 +186,18 @@ def test_touch_broken_pipe(scene: Path, tmp_path: Path) -> None:
         assert process.stdout.readline().startswith("{")
         process.stdout.close()
         assert process.stderr.read() == ""
+
+
+def test_distance_line_break_in_name_escaped(run: Run, scene: Path) -> None:
+    corners = np.array([[1.0, 0.0, 0.0], [1.1, 0.0, 0.0], [1.0, 0.1, 0.0]])
+    part = Part("up\ndown\x1b[31m", corners, np.array([[0, 1, 2]]), np.eye(4))
+    with hapticdb.open(scene) as env:
+        place = 0.5 * env.grid.bounds.sum(axis=0)
+        part.world_from_part[:3, 3] = place - (1.0, 0.0, 0.0)
+        (added,) = env.add(part).added
+    out = succeeded(run("distance", scene, "box0", added.id))
+    assert out.startswith("box0 and up\\ndown\\x1b[31m ")
+    assert len(out.splitlines()) == 3
 
 
 def test_objects_names_beyond_terminal_encoding(run: Run, tmp_path: Path) -> None:

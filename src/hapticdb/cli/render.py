@@ -59,7 +59,7 @@ def program() -> str:
 
 def say(text: str = "", status: int | None = None) -> None:
     """Print a line of a result; the first clause of a verdict in the colour of its exit code."""
-    shown, plain_one = printable(text), os.environ.get("NO_COLOR") or not sys.stdout.isatty()
+    shown, plain_one = one_line(text), os.environ.get("NO_COLOR") or not sys.stdout.isatty()
     if status is not None and not plain_one:
         clause = re.split("[:;,]", shown, maxsplit=1)[0]
         colour = COLOURS.get(status, 33)

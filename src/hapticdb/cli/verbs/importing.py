@@ -127,7 +127,8 @@ def _print_reports(
             more = {"objects": len(report.added), "voxels": n_voxels}
             render.say_json(plain(report) | more | {"scene": render.box_record(scene)})
         elif report.error is None:
-            render.say("\n  ".join(_lines(file, report)))
+            for line_of_file in _lines(file, report):
+                render.say(line_of_file)
         if report.error is not None:
             render.note(str(report.error))
     if not output.json and any(report.status == "imported" for report in reports):
@@ -148,7 +149,7 @@ def _warn_of_voxels(size: float, bits: int) -> None:
 
 
 def _lines(file: str, report: "FileReport") -> list[str]:
-    """Result of a file and remarks on it, a line each."""
+    """Result of a file, and remarks on it, indented."""
     if report.status == "complete":
         there = render.counted(report.present, "object")
         line = f"{file}: complete already ({there}), nothing to do"
@@ -165,11 +166,12 @@ def _lines(file: str, report: "FileReport") -> list[str]:
             line += f"; {count} {words}" if count else ""
     if report.still_removed:
         line += f"; {render.counted(report.still_removed, 'removed part')} left out"
-    lines = [line]
+    lines = []
     if report.is_unit_assumed:
         lines.append("its unit is not known: its numbers are taken as metres; --unit gives another")
     if report.chord:
         lines.append(f"chord error of its triangles: {length_text(report.chord)}")
     if report.defects:
         lines.append(f"found in the file: {report.defects.describe()}")
-    return [*lines, *(f"note: {note}" for note in report.notes)]
+    lines += [f"note: {note}" for note in report.notes]
+    return [line, *(f"  {one}" for one in lines)]

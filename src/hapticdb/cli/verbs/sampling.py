@@ -54,8 +54,8 @@ def demo(
         comparison = compare(scene, progress)
     for measured in comparison.layouts:
         _show_layout(measured, scene, float(np.median(found.hits)))
-    render.say(f"\n{comparison.against_paper()}")
-    render.say(comparison.verdict)
+    for line in ("", comparison.against_paper(), comparison.verdict):
+        render.say(line)
     if comparison.disagreed:
         raise typer.Exit(1)
 
@@ -83,11 +83,13 @@ def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> 
         rows.append((name, f"{median:.0f}", f"{p99:.0f}", *counts, f"{base / median:.1f}"))
     keys = np.median([query.ranges for query in measured.queries[YARDSTICK]])
     one = measured.imported
+    rows_there = render.counted(one.rows, "row")
+    render.say()
+    render.say(f"{one.engine}, {one.layout} layout, {rows_there}; warm, strategies in turns")
     render.say(
-        f"\n{one.engine}, {one.layout} layout, {render.counted(one.rows, 'row')}; "
-        "warm, strategies in turns\n"
-        f"a frame: {len(scene.shell)} points, {keys:.0f} distinct keys, {hits:.0f} hits (medians)\n"
+        f"a frame: {len(scene.shell)} points, {keys:.0f} distinct keys, {hits:.0f} hits (medians)"
     )
+    render.say()
     columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")
     render.table(columns, rows)
     used = Counter(query.strategy for query in measured.queries["auto"])

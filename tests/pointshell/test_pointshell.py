@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hapticdb.errors import FileError, UsageError
 from hapticdb.pointshell.orientation import components
-from hapticdb.pointshell.shell import PointShell, fibonacci_sphere
+from hapticdb.pointshell.shell import FORMAT, PointShell, fibonacci_sphere
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -312,6 +312,15 @@ def test_shell_load_bad_file(tmp_path: Path) -> None:
         PointShell.load(tmp_path / "missing.npz")
     with pytest.raises(FileError, match="cannot write"):
         shell.save(tmp_path / "missing" / "tool.npz")
+
+
+def test_shell_load_too_large_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "tool.npz"
+    np.savez_compressed(path, format=np.array(FORMAT), points=np.zeros((200_000, 3)))
+    monkeypatch.setattr("hapticdb.pointshell.shell.MAX_POINTS", 1000)
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("unpacked"))
+    with pytest.raises(FileError, match=r"tool\.npz: 6\d+ points: a shell has 1 to 1000$"):
+        PointShell.load(path)
 
 
 def test_shell_constructor_checks() -> None:

@@ -120,6 +120,17 @@ def _laz(path: Path, point_format: int, n_points: int) -> Path:
     return path
 
 
+def test_read_file_laz_crash_is_damage(tmp_path: Path) -> None:
+    path = _laz(tmp_path / "a.laz", 3, 100)
+    content = bytearray(path.read_bytes())
+    points_at = int.from_bytes(content[96:100], "little")
+    table_at = int.from_bytes(content[points_at : points_at + 8], "little")
+    content[table_at + 4 : table_at + 8] = b"\xff" * 4  # number of chunks
+    path.write_bytes(content)
+    with pytest.raises(FileError, match=r"a\.laz: it is damaged or cut short, .*: copy it anew"):
+        read_file(path)
+
+
 @pytest.mark.parametrize("point_format", [3, 6, 10])
 def test_las_laz_point_formats_in_chunks(tmp_path: Path, point_format: int) -> None:
     n_points = 110_000  # chunks have 50,000 points

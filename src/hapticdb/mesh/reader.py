@@ -44,7 +44,7 @@ _WAITING = 10.0
 _LIBRARIES = {
     "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
     "ifc": ("IfcOpenShell", "save it anew as IFC4, or as glTF"),
-    "las": ("lazrs, its decompressor,", "unpack it to LAS with another program, or save it anew"),
+    "las": ("lazrs, its decompressor", "unpack it to LAS with another program"),
 }
 """Libraries that may crash on a damaged file, by reader: name, and advice for the user."""
 _LONGEST_CAUSE = 300
@@ -250,8 +250,8 @@ def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:
         reader = READERS[Path(path).suffix.lower()]
         library, advice = _LIBRARIES.get(reader, ("its parser", "save it anew"))
         return (
-            f"{library} crashed on it ({name}): it is damaged, or asks for more memory than a file "
-            f"of its size may use; {advice}"
+            f"it is damaged or cut short, or asks for more memory than a file of its size may use "
+            f"({name} of {library}): copy it anew from its source, or {advice}"
         )
     words.seek(0)
     lines = words.read()[-4096:].decode("utf-8", "replace").split("\n")

@@ -1,16 +1,14 @@
 """Point spacing on a surface, bisection of triangles, membership in closed bodies."""
 
 from copy import copy
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces import triangle_bvh
 from hapticdb.kernels.triangles.depth import Solid
-
-if TYPE_CHECKING:
-    from hapticdb.pointshell.orientation import Surface
+from hapticdb.pointshell.orientation import Surface
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +45,7 @@ class Interior:
     metres.
     """
 
-    def __init__(self, surface: "Surface") -> None:
+    def __init__(self, surface: Surface) -> None:
         self.origin = surface.center
         local = surface.triangles - surface.center
         tree = triangle_bvh.triangle_bvh(local, surface.bodies)

@@ -55,18 +55,6 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-class Balls(NamedTuple):
-    """Tangent balls at given positions.
-
-    radius (Q,) metres; facing (Q,): cosine between the position's inward normal and that of the
-    most opposed touching surface: -1 between parallel walls, -cos(a) in a wedge of angle a, 1
-    without another contact.
-    """
-
-    radius: Floats
-    facing: Floats
-
-
 class _Octave(NamedTuple):
     """Pieces of the surface of about one size, within a factor of two."""
 
@@ -131,11 +119,15 @@ class InscribedBalls:
         whole, numbers = zip(*done, strict=True)
         return np.concatenate(whole), np.concatenate(numbers)
 
-    def touching(self, positions: Floats, face_of: NDArray[np.int32], radius: float) -> Balls:
-        """Largest balls, `radius` at most, tangent to the surface at positions (Q, 3).
+    def touching(
+        self, positions: Floats, face_of: NDArray[np.int32], radius: float
+    ) -> tuple[Floats, Floats]:
+        """Radii and facings (Q,) of the largest balls, tangent to the surface at positions (Q, 3).
 
-        face_of (Q,) : face of each position. The radius is 0 on an open surface without matter
-        behind it.
+        face_of (Q,) : face of each position; radius : the greatest, metres. It is 0 on an open
+        surface without matter behind it. A facing is the cosine between the position's inward
+        normal and that of the most opposed touching surface: -1 between parallel walls, -cos(a) in
+        a wedge of angle a, 1 without another contact.
         """
         local = positions - self._center
         radii, facing = self._shrunk(local, face_of, radius)
@@ -144,7 +136,7 @@ class InscribedBalls:
         if len(is_open):
             middles = local[is_open] + 0.5 * radii[is_open, None] * self._normals[face_of[is_open]]
             radii[is_open[~self._has_matter(middles)]] = 0.0
-        return Balls(radii, facing)
+        return radii, facing
 
     def _see_thin_walls(
         self, local: Floats, face_of: NDArray[np.int32], radii: Floats, facing: Floats, most: float

@@ -9,17 +9,13 @@ points at the greatest possible inset, half the thickness. So do details that wo
 more than one inset.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces import blue_noise
 from hapticdb.pointshell.coverage import spacing_of
 from hapticdb.pointshell.inscribed import SLACK, InscribedBalls
-
-if TYPE_CHECKING:
-    from hapticdb.pointshell.orientation import Surface
+from hapticdb.pointshell.orientation import Surface
 
 SAMPLES = 5
 """Initial samples for each requested point."""
@@ -37,20 +33,13 @@ no position touches late by more than one inset. Larger: more corners without po
 Floats = NDArray[np.float64]
 
 
-class _InsetPoints(NamedTuple):
-    """Points drawn inward."""
-
-    points: Floats  # (N, 3)
-    faces: NDArray[np.int32]  # (N,) face on which the sample of each lies
-    inset: Floats  # (N,) metres from the sample to its image
-
-
 def sample_inset(
-    surface: "Surface", n_points: int, inset: float, rng: np.random.Generator
-) -> _InsetPoints:
+    surface: Surface, n_points: int, inset: float, rng: np.random.Generator
+) -> tuple[Floats, NDArray[np.int32], Floats]:
     """Points spread evenly over the surface and drawn inward by `inset` metres; see the module.
 
-    Points of open surfaces without matter behind them stay on the surface.
+    Points of open surfaces without matter behind them stay on the surface. Returns points (N, 3),
+    faces (N,) of their samples, and distances (N,), metres, to these.
     """
     balls = InscribedBalls(surface, inset)
     per_point = SAMPLES
@@ -76,7 +65,7 @@ def sample_inset(
     kept = np.flatnonzero(is_kept)
     share = len(kept) / len(samples)
     chosen = kept[_spread(samples[kept], images[kept], faces[kept], surface, n_points, share)]
-    return _InsetPoints(images[chosen], faces[chosen], radius[chosen])
+    return images[chosen], faces[chosen], radius[chosen]
 
 
 def _is_late(samples: Floats, images: Floats, latest: float) -> NDArray[np.bool_]:
@@ -91,7 +80,7 @@ def _spread(
     samples: Floats,
     images: Floats,
     faces: NDArray[np.int32],
-    surface: "Surface",
+    surface: Surface,
     n_points: int,
     share: float,
 ) -> NDArray[np.intp]:

@@ -1,7 +1,6 @@
 """A surface for exact queries: its BVH, and on demand its inside, connected pieces and normals."""
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +9,7 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH, normals_of, triangle_bvh
 from hapticdb.kernels.triangles.offsets import FLAT
 from hapticdb.pointshell.coverage import Interior
-from hapticdb.pointshell.orientation import components, faces_of, orient
-
-if TYPE_CHECKING:
-    from hapticdb.pointshell.orientation import Surface
+from hapticdb.pointshell.orientation import Surface, components, faces_of, orient
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -35,7 +31,7 @@ class CollisionShape:
     """
 
     def __init__(
-        self, triangles: Floats, surface: "Surface | None" = None, *, radius: float = 0.0,
+        self, triangles: Floats, surface: Surface | None = None, *, radius: float = 0.0,
         is_cloud: bool = False, chord: float = 0.0, index: Ints | None = None,
     ) -> None:  # fmt: skip
         """Build the tree.
@@ -49,7 +45,7 @@ class CollisionShape:
         self._given, self._index = surface, index
 
     @cached_property
-    def _oriented(self) -> "tuple[Surface, Ints] | None":
+    def _oriented(self) -> tuple[Surface, Ints] | None:
         """Surface with its inner side, and the tree's number of each of its triangles (F,)."""
         if self._given is not None:
             return self._given, np.argsort(self.tree.faces)

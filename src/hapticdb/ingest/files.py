@@ -8,7 +8,7 @@ import contextlib
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,8 +142,7 @@ class ImportOptions:
     @property
     def reading(self) -> dict[str, Any]:
         """Given options of `read_file`, by name."""
-        named = {name: getattr(self, name) for name in _READING}
-        return {name: value for name, value in named.items() if value is not None}
+        return {name: getattr(self, name) for name in _READING if getattr(self, name) is not None}
 
 
 def import_files(
@@ -168,7 +167,7 @@ def import_files(
         raise UsageError(f"files {files!r}: give a list of files")
     if not files:
         raise UsageError("no files: name at least one to import")
-    with connected(chosen.on) as workers, _Target(url, chosen) as target:
+    with connected(chosen.on) as workers, contextlib.closing(_Target(url, chosen)) as target:
         sources = _Sources(files, chosen.reading)
         with target.loading:
             reports = [
@@ -258,10 +257,7 @@ class _Target:
             check_curve(options.grid.curve or "z", self._layout)
             wants_distances(self._layout, options.distances)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         """Close the store; discard an environment created here without a write."""
         if self.store is None:
             return

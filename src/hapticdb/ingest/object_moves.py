@@ -35,20 +35,8 @@ def restore_object(store: Store, record: Object) -> int:
             "which has its surface"
         )
     part = unpacked_part(store.url, record, surface)
-    bounds = bounds_inside(part, record.link, store.grid, record.transform)
-    rows, n_voxels = rows_of_part(
-        part, store.grid, store.layout, record.transform, distances=record.has_distances
-    )
-    new = replace(
-        record,
-        voxels=n_voxels,
-        bounds=bounds,
-        revision=0,
-        rows_crc=None,
-        distances_crc=None,
-        surface=None,
-    )
-    return store.add(new, rows, surface)
+    new, rows = _moved(store, record, part, record.transform)
+    return store.add(replace(new, surface=None), rows, surface)
 
 
 def rewrite_object(store: Store, obj: Object) -> None:

@@ -35,13 +35,7 @@ AT_BORDER = 1e-6
 def check_names(mesh_file: MeshFile) -> None:
     """Refuse names that some engine cannot store as text."""
     for name in (mesh_file.link, *(part.name for part in mesh_file.parts)):
-        try:
-            name.encode()
-        except UnicodeEncodeError:
-            is_text = False
-        else:
-            is_text = "\0" not in name
-        if not is_text:
+        if "\0" in name or name.encode(errors="replace").decode() != name:
             raise FileError(f"{mesh_file.link!a}: the name {name!a} is no text: rename it")
 
 

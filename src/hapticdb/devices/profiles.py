@@ -7,7 +7,6 @@ stiffness of a session from it.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 from hapticdb.errors import UsageError
 
@@ -96,20 +95,9 @@ SCRIPTED = DeviceProfile(
 """Profile of a scripted hand: no force moves it."""
 
 
-@runtime_checkable
-class _SupportsProfile(Protocol):
-    """A device with a profile, available before it is opened."""
-
-    @property
-    def profile(self) -> DeviceProfile:
-        """Rendering limits of the device."""
-
-
 def profile_of(device: object) -> DeviceProfile:
     """Profile of a device; `UNKNOWN` without one; UsageError unless it is a `DeviceProfile`."""
-    if not isinstance(device, _SupportsProfile):
-        return UNKNOWN
-    profile = device.profile
+    profile = getattr(device, "profile", UNKNOWN)  # known before the device is opened
     if not isinstance(profile, DeviceProfile):
         raise UsageError(
             f"{type(device).__name__}.profile is of the type {type(profile).__name__}; "

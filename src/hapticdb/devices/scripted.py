@@ -230,10 +230,7 @@ def _random_waves(
 
 
 def _waves_above(slowest: float, seed: int) -> NDArray[np.float64]:
-    """Waves (6, 8, 4): amplitude 1 / f^2, angular frequency, random phase, and its sine.
-
-    Frequencies f from `slowest` to `FASTEST` Hz.
-    """
+    """Waves (6, 8, 4) above `slowest` Hz: amplitude 1 / f^2, angular frequency, phase, its sine."""
     random = np.random.default_rng(seed)
     steps = np.linspace(0.0, 1.0, N_WAVES)
     spread = np.clip(steps + random.uniform(-0.5, 0.5, (6, N_WAVES)) / N_WAVES, 0.0, 1.0)

@@ -90,11 +90,8 @@ def _stable_text(profile: DeviceProfile, rate: float, delay: float) -> str:
         grip = " in a light grip"
         if profile.mass is None:
             mass = f" (mass not known: {LIGHTEST:g} kg assumed)"
+    hertz = f"{rate / 1e3:.4g} kHz" if rate >= 1e3 else f"{rate:.4g} Hz"
     return (
-        f"at {_hertz(rate)} and {1e3 * delay:.3g} ms of delay the device {profile.name}{mass} "
+        f"at {hertz} and {1e3 * delay:.3g} ms of delay the device {profile.name}{mass} "
         f"stays stable up to that{grip}; a higher rate or a shorter delay allows more"
     )
-
-
-def _hertz(rate: float) -> str:
-    return f"{rate / 1e3:.4g} kHz" if rate >= 1e3 else f"{rate:.4g} Hz"

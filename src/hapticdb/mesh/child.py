@@ -44,21 +44,16 @@ def main() -> None:
     # parsers in other languages may abort on a damaged file
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     request = json.loads(sys.stdin.buffer.read())
-    _die_with_parent(request["parent"])
+    if sys.platform == "linux":  # end with the parent; elsewhere the time limit applies
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != request["parent"]:
+        os._exit(1)
     answer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output of libraries must not mix with the arrays
     sys.path[:] = request["sys_path"]
     _answer(answer, Path(request["path"]), request)
     answer.flush()
     os._exit(0)  # freeing a large parser's memory would take longer
-
-
-def _die_with_parent(parent: int) -> None:
-    """End with the parent, however it ends (Linux only; elsewhere the time limit applies)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:

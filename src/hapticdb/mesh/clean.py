@@ -39,7 +39,10 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
     total = parsed.defects
     taken: dict[str, int] = {}
     worlds, is_near = _worlds(parsed.placements, [one[0] for one in checked], scale)
-    is_flat = _are_flat(worlds)
+    linear = worlds[:, :3, :3]
+    sizes = np.sqrt(np.einsum("pij,pij->p", linear, linear))
+    # singular up to rounding: triangles may lose their areas
+    is_flat = np.abs(np.linalg.det(linear)) <= 1e-9 * sizes**3
     for n, placement in enumerate(parsed.placements):
         vertices, faces, defects, colours = checked[placement.shape]
         n_found = len(vertices if faces is None else faces)
@@ -193,13 +196,6 @@ def _worlds(
     reach += np.abs(worlds[:, :3, 3])
     # Squares of lengths must be finite as well, for areas and separations.
     return worlds, np.isfinite(_squares(reach))
-
-
-def _are_flat(worlds: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether a transform is singular up to rounding, so triangles may lose their areas."""
-    linear = worlds[:, :3, :3]
-    lengths = np.sqrt(np.einsum("pij,pij->p", linear, linear))
-    return np.asarray(np.abs(np.linalg.det(linear)) <= 1e-9 * lengths**3)
 
 
 def _printable(name: str) -> str:

@@ -4,6 +4,7 @@ The child is started by its path: `multiprocessing` would run the user's main mo
 shared by several parts is sent once.
 """
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -82,7 +83,9 @@ def read_file(
     """
     check_chord(chord)
     metres, file = _checked(path, unit)
-    seconds = _seconds_for(file) if time_limit is None else time_limit
+    each = _SECONDS_PER_MIB_OF.get(READERS[file.suffix.lower()], _SECONDS_PER_MIB)
+    own = _SECONDS + each * file.stat().st_size / (1 << 20)
+    seconds = own if time_limit is None else time_limit
     request = {
         "path": str(file), "metres": metres, "chord": chord, "memory_limit": memory_limit,
         "time_limit": seconds, "parent": os.getpid(), "sys_path": sys.path,
@@ -107,11 +110,6 @@ def parse_in_process(
         raise FileError(_one_line(path, error)) from None
 
 
-def _seconds_for(file: Path) -> float:
-    each = _SECONDS_PER_MIB_OF.get(READERS[file.suffix.lower()], _SECONDS_PER_MIB)
-    return _SECONDS + each * file.stat().st_size / (1 << 20)
-
-
 def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | None, Path]:
     """Length of the given unit, and the resolved path; raises all errors that need no parsing."""
     metres = None if unit is None else metres_of(unit)
@@ -123,7 +121,9 @@ def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | No
         refusal = (getattr(error, "strerror", None) or str(error)).lower()
     if refusal is not None:
         raise FileError(_one_line(path, refusal))
-    _require_extra(READERS[file.suffix.lower()], file.suffix)
+    extra, modules = _EXTRAS.get(READERS[file.suffix.lower()], ("", ()))
+    if any(importlib.util.find_spec(module) is None for module in modules):
+        raise MissingExtraError(f"{file.suffix} files need more packages: {pip_line(extra)}")
     return metres, file
 
 
@@ -142,13 +142,6 @@ def _refusal(file: Path) -> str | None:
         return None if stream.read(1) else "it is empty"
 
 
-def _require_extra(reader: str, suffix: str) -> None:
-    """Raise MissingExtraError before a child process fails without the extra."""
-    extra, modules = _EXTRAS.get(reader, ("", ()))
-    if any(importlib.util.find_spec(module) is None for module in modules):
-        raise MissingExtraError(f"{suffix} files need more packages: {pip_line(extra)}")
-
-
 def _one_line(path: str | os.PathLike[str], cause: object) -> str:
     """One printable line of file and cause."""
     words = " ".join(str(cause).split())
@@ -163,14 +156,13 @@ def _run_child(request: dict[str, Any], seconds: float) -> MeshFile:
     # One arena and one thread: memory reserved per thread would count as the file's.
     settings = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     settings["MALLOC_ARENA_MAX"] = "2"
-    with scratch_folder() as scratch, tempfile.TemporaryFile() as words:
-        child = subprocess.Popen(  # noqa: S603 - our own interpreter and file
-            [sys.executable, "-P", str(_CHILD)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=words,
-            env=os.environ | settings | {"TMPDIR": scratch},
-        )
+    with contextlib.ExitStack() as held:
+        scratch = held.enter_context(scratch_folder())
+        words = held.enter_context(tempfile.TemporaryFile())
+        child = held.enter_context(subprocess.Popen(  # noqa: S603 - our own interpreter and file
+            [sys.executable, "-P", str(_CHILD)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=words, env=os.environ | settings | {"TMPDIR": scratch},
+        ))  # fmt: skip
         late = threading.Event()
         longest = min(_WAITING * seconds, threading.TIMEOUT_MAX)
         timer = threading.Timer(longest, _end, (child, late))
@@ -182,9 +174,6 @@ def _run_child(request: dict[str, Any], seconds: float) -> MeshFile:
             timer.cancel()
             child.kill()
             child.wait()
-            for pipe in (child.stdin, child.stdout):
-                if pipe is not None:
-                    pipe.close()
         if found is None:
             took = f"longer than {seconds:.3g} s of processor time"
             if late.is_set():
@@ -202,8 +191,7 @@ def _end(child: subprocess.Popen[bytes], late: threading.Event) -> None:
 
 def _talk(child: subprocess.Popen[bytes], request: dict[str, Any]) -> MeshFile | None:
     """Send the request and receive the answer; None if the child ended before its answer."""
-    if child.stdin is None or child.stdout is None:  # both are pipes: for the type checker
-        return None
+    assert child.stdin is not None and child.stdout is not None  # noqa: S101, PT018 - pipes
     try:
         child.stdin.write(json.dumps(request).encode())
         child.stdin.close()

@@ -46,7 +46,8 @@ def pack(
         planes.append(_planes(_differences(faces), _width(len(vertices))))
     packed = zlib.compress(b"".join(planes), LEVEL)
     painted = b"" if colours is None else _packed_colours(colours)
-    return HEADER.pack(len(vertices), n_faces) + packed + painted + _packed_chord(chord)
+    last = CHORD.pack(chord) if chord else b""
+    return HEADER.pack(len(vertices), n_faces) + packed + painted + last
 
 
 def unpack(data: bytes) -> tuple[Vertices, Faces | None, Colours | None, float]:
@@ -57,11 +58,7 @@ def unpack(data: bytes) -> tuple[Vertices, Faces | None, Colours | None, float]:
     width = _width(n_vertices)
     split = 24 * n_vertices
     size = split + (0 if n_faces == CLOUD else 3 * width * n_faces)
-    if size > MOST_RATIO * len(data):
-        raise ValueError("a surface that tells of more than it holds")
     planes, rest = _inflated(data[HEADER.size :], size)
-    if len(planes) != size:
-        raise ValueError("a surface of another length than it tells")
     n_colours = n_vertices if n_faces == CLOUD else n_faces
     colours = None
     if len(rest) > CHORD.size:
@@ -80,12 +77,8 @@ def unpack(data: bytes) -> tuple[Vertices, Faces | None, Colours | None, float]:
     return vertices, faces, colours, chord
 
 
-def _packed_chord(chord: float) -> bytes:
-    return CHORD.pack(chord) if chord else b""
-
-
 def _unpacked_chord(data: bytes) -> float:
-    """Inverse of `_packed_chord`."""
+    """Chord error, metres, of the last bytes; 0 for none."""
     if not data:
         return 0.0
     chord = float(CHORD.unpack(data)[0]) if len(data) == CHORD.size else 0.0
@@ -94,14 +87,16 @@ def _unpacked_chord(data: bytes) -> float:
     return chord
 
 
-def _inflated(data: bytes, most: int) -> tuple[bytes, bytes]:
-    """Content of a zlib stream, at most `most` bytes, and the bytes after it; ValueError."""
+def _inflated(data: bytes, size: int) -> tuple[bytes, bytes]:
+    """Content of a zlib stream, `size` bytes, and the bytes after it; ValueError."""
+    if size > MOST_RATIO * len(data):
+        raise ValueError("a surface that tells of more than it holds")
     unpacking = zlib.decompressobj()
     try:
-        found = unpacking.decompress(data, most)
+        found = unpacking.decompress(data, size)
     except zlib.error as error:
         raise ValueError(f"a surface that cannot be unpacked: {error}") from None
-    if not unpacking.eof:
+    if not unpacking.eof or len(found) != size:
         raise ValueError("a surface of another length than it tells")
     return found, unpacking.unused_data
 
@@ -125,11 +120,7 @@ def _unpacked_colours(data: bytes, n: int) -> tuple[Colours, bytes]:
         raise ValueError("a surface with more colours than triangles")
     kind = np.dtype(_number_type(n_palette))
     size = 4 * n_palette + (kind.itemsize * n if n_palette != n else 0)
-    if size > MOST_RATIO * len(data):
-        raise ValueError("a surface that tells of more than it holds")
     content, rest = _inflated(data[COUNT.size :], size)
-    if len(content) != size:
-        raise ValueError("a surface of another length than it tells")
     planes = np.frombuffer(content, np.uint8, 4 * n_palette).reshape(4, n_palette)
     colours = np.ascontiguousarray(planes.T)
     if n_palette != n:

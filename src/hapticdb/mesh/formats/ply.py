@@ -190,14 +190,10 @@ def _faces(
             found, incomplete = triangulated(vertices, [_whole(row).tolist() for row in rows])
             pieces.append(found)
     for row in _corners(strips) if strips else ():
-        whole = _whole(row)
-        pieces += map(strip, _split(whole))
+        whole = _whole(row)  # strips, separated by -1
+        several = np.split(whole, np.flatnonzero(whole < 0))
+        pieces += [strip(one[one >= 0]) for one in several]
     return np.concatenate(pieces), incomplete
-
-
-def _split(whole: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Strips of a row, separated by -1."""
-    return [piece[piece >= 0] for piece in np.split(whole, np.flatnonzero(whole < 0))]
 
 
 def _corners(table: dict[str, Column]) -> Column:

@@ -137,6 +137,7 @@ def test_clashes_html_self_contained_and_escaped(run: Run, tmp_path: Path) -> No
     page = (tmp_path / "meet.html").read_text()
     assert "<script" not in page
     assert html.escape(name) in page
+    assert "(gone)" not in page  # nothing is, and no pair has a reason
     assert re.findall(r"(?:src|href)=.([a-z:]*)", page) == ["data:image"]  # one of each group
     matrix = page[page.index("class=matrix") :]
     assert re.findall(r"<td[^>]*>(\d*/?\d*)", matrix)[:4] == ["1/1", "1/1", "1/1", ""]

@@ -41,7 +41,8 @@ class Canvas:
         self._sun = self._axes @ turned(SUN, up)
         corners = corners_of(boxes).reshape(-1, 3)
         low, high = (corners @ self._axes.T).min(axis=0), (corners @ self._axes.T).max(axis=0)
-        self._scale = float(((window[1] - window[0]) / (high - low)[:2]).min())
+        scale = float(((window[1] - window[0]) / (high - low)[:2]).min())
+        self._factors = np.array([scale, scale, 1.0])
         self._shift = np.append(window.mean(axis=0), 0.0) - 0.5 * (low + high) * self._factors
         # half depth of the view; surfaces outside are clipped
         reach = 0.75 * float(np.linalg.norm(np.ptp(corners, axis=0)))
@@ -49,10 +50,6 @@ class Canvas:
         self._depths = np.full((size[1] * SAMPLES, size[0] * SAMPLES), reach, np.float32)
         self._nearest = -reach
         self._image = np.ones((*self._depths.shape, 3), np.float32) * paper.astype(np.float32)
-
-    @property
-    def _factors(self) -> Floats:
-        return np.array([self._scale, self._scale, 1.0])
 
     def project(self, points: Floats) -> Floats:
         """Pixels across and down, and metres behind the boxes' middle, of points (..., 3)."""

@@ -83,7 +83,8 @@ def clashes_page(
 
 def _text(words: str | None) -> str:
     """Words in HTML, with question marks for unprintable letters."""
-    shown = "".join(letter if letter.isprintable() else "?" for letter in words or "(gone)")
+    words = "(gone)" if words is None else words
+    shown = "".join(letter if letter.isprintable() else "?" for letter in words)
     return html.escape(shown)
 
 

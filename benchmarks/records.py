@@ -1,5 +1,6 @@
 """Results as JSON: what was measured, at which commit, on which machine, with which versions."""
 
+import argparse
 import json
 import os
 import platform
@@ -17,10 +18,29 @@ GIT_S = 10.0
 """Seconds that git may take to name the commit; a larger value waits longer for a slow disk."""
 
 
+def first_line(text: str | None) -> str:
+    """First line of a script's docstring, for its help."""
+    return (text or "").partition("\n")[0]
+
+
+def asked(doc: str | None, quick: str) -> tuple[bool, Path]:
+    """Whether a script runs with `--quick`, which its help explains; the folder of its results."""
+    parser = argparse.ArgumentParser(description=first_line(doc))
+    parser.add_argument("--quick", action="store_true", help=quick)
+    is_quick = parser.parse_args().quick
+    return is_quick, Path("results-quick" if is_quick else "results")
+
+
+def data(name: str) -> Path | None:
+    """File in the folder that HAPTICDB_TEST_DATA names, if it is there."""
+    file = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), name)
+    return file if file.is_file() else None
+
+
 def conditions() -> dict[str, Any]:
     """What every record says first: commit, machine and versions."""
-    asked = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
-    done = subprocess.run(asked, capture_output=True, text=True, check=True, timeout=GIT_S)
+    line = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    done = subprocess.run(line, capture_output=True, text=True, check=True, timeout=GIT_S)
     return {
         "commit": done.stdout.strip(),
         "machine": machine(),

@@ -1,135 +1,202 @@
 """Prove that two commits compute the same: every wrench, row, session and sweep, bit for bit.
 
-Each commit runs this script once, on the same machine, and writes digests into a JSON file:
+    HAPTICDB_TEST_DATA=... python benchmarks/same_bits.py --before /tmp/before/src [--quick]
 
-    export HAPTICDB_TEST_DATA=/data  PYTHONPATH=/tmp/before/src
-    python benchmarks/same_bits.py /tmp/bits/before --out before.json
-    export PYTHONPATH=src
-    python benchmarks/same_bits.py /tmp/bits/after --out after.json --replay /tmp/bits/before-*.rec
-    python benchmarks/same_bits.py --compare before.json after.json
-
-The folder's databases are imported unless they are there: a copy of one commit's folder shows
-whether the other commit reads it equally. A run records a session for each environment beside the
-folder (``before-sqlite-brick.rec``); ``--replay`` replays those of another commit instead. A
-session's times are measured, so two recordings differ: only ``--replay`` compares commits.
-
-Each digest is written when it is found. The environments hold the vintage car at 2048 voxels an
-axis, on SQLite in both layouts and on every PostgreSQL found. Compared are the stored rows; force,
-torque, hits, depths and objects at 1,000 poses, for each strategy and for all poses at once; the
-statements of a strategy, unless they depend on measured costs; the verdict of ``sweep``; and, by
-replays, all frames of a session whose simulated hand the force pushes back. Only public names and
-the command line are used.
+Each tree runs in a process of its own. It imports the vintage car (without data the sample) on
+SQLite in both layouts and on every PostgreSQL found; its digests are of the stored rows, of
+touches by each strategy and of all poses at once, of the statements of strategies unless they
+depend on measured costs, of ``sweep``, and of replays of sessions that the first tree recorded.
+Only public names and the command line are used.
 """
 
 import argparse
 import contextlib
+import hashlib
 import json
-import platform
+import os
+import sqlite3
 import subprocess
-from collections.abc import Sequence
+import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 import hapticdb
-from bits_digests import Digest, Results, recorded, replayed, stored, swept, touched
-from bits_inputs import Place, command, import_car, sample_tool
+import records
+from hapticdb.sample import write_sample
+from places import find_binaries, serving
+from slide_paths import write_along
+
+Layout = Literal["brick", "voxel"]
+Strategy = Literal["statement", "array", "points", "maxgap", "cbgroup", "auto"]
+STRATEGIES: tuple[Strategy, ...] = ("statement", "array", "points", "maxgap", "cbgroup", "auto")
+MEASURED = ("cbgroup", "auto")
+"""Strategies whose statements depend on measured costs, and so differ between runs."""
+HAND = slice(200, 700)
+"""Poses of the path that a session's hand follows; at the first the tool touches nothing."""
+SESSION = "--law plane --rate 512 --speed 0.1 --simulate --no-baseline --seconds 2 --record"
+LONGEST_S = 3600.0
+"""Seconds after which a tree counts as hung."""
 
 
-def recordings_of(places: Sequence[Place], given: Sequence[Path]) -> dict[str, Path]:
-    """Environment -> recording; the end of a file's name is the environment's name."""
-    found: dict[str, Path] = {}
-    for file in given:
-        names = [place.name for place in places if file.stem.endswith(place.name)]
-        if len(names) != 1 or names[0] in found:
-            known = ", ".join(place.name for place in places)
-            raise SystemExit(f"{file}: give one recording an environment, named -NAME.rec: {known}")
-        found[names[0]] = file
-    return found
+class Digests(dict[str, tuple[str, str]]):
+    """SHA-256 and what was digested, by name; types and shapes keep neighbouring arrays apart."""
+
+    def add(self, name: str, of: str, *values: ArrayLike) -> None:
+        """Digest arrays, numbers or text."""
+        sha = hashlib.sha256()
+        for value in values:
+            array = np.ascontiguousarray(value)
+            sha.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
+        self[name] = sha.hexdigest(), of
+        print(name, of, file=sys.stderr, flush=True)
 
 
-def measure(
-    folder: Path, places: list[Place], given: list[Path], n_poses: int, results: Results
+def command(*words: object) -> dict[str, Any]:
+    """Run ``hapticdb`` and return its JSON; exit codes 1 and 3 are verdicts, not failures."""
+    line = [sys.executable, "-m", "hapticdb", *map(str, words), "--json"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=600, check=False)
+    if done.returncode not in {0, 1, 3} or not done.stdout:
+        raise SystemExit(f"{' '.join(line)} ends with {done.returncode}: {done.stderr}")
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+def places(folder: Path, *, is_quick: bool) -> Iterator[tuple[str, str, Layout]]:
+    """Name, URL and layout of each environment; a server ends with its turn."""
+    layouts: tuple[Layout, ...] = ("brick",) if is_quick else ("brick", "voxel")
+    for layout in layouts:
+        yield f"sqlite-{layout}", str(folder / f"{layout}.db"), layout
+    for found in () if is_quick else find_binaries():
+        with serving(folder / f"server{found.major}", found, {}) as server:
+            yield f"postgresql{found.major}", server.conninfo(), "brick"
+
+
+def chosen_poses(
+    env: hapticdb.Environment, shell: hapticdb.PointShell, path: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Poses (count, 4, 4): with a point of the shell near a voxel; a tenth along, or anywhere."""
+    rng, edge = np.random.default_rng(13), env.grid.edge
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, random_state=13).as_matrix()
+    objects = env.objects()
+    drawn = [objects[n].id for n in rng.integers(len(objects), size=20)]
+    centers = np.concatenate([env.grid.centers(env.voxels(one)) for one in drawn])
+    poses[:, :3, 3] = rng.choice(centers, count) + rng.normal(size=(count, 3)) * env.grid.voxel_size
+    poses[:, :3, 3] -= np.einsum("nij,nj->ni", poses[:, :3, :3], rng.choice(shell.points, count))
+    anywhere = rng.uniform(-0.1, 1.1, (len(poses[::10]), 3))
+    poses[::10, :3, 3] = np.array(env.grid.origin) + edge * anywhere
+    poses[1::10] = path[: len(poses[1::10])]
+    return poses
+
+
+def stored(digests: Digests, name: str, env: hapticdb.Environment, url: str, table: str) -> None:
+    """Objects, voxels, the histogram of keys, and all rows (on a server: of a copy)."""
+    for obj in env.objects():
+        described = json.dumps(dict(obj.attributes), sort_keys=True, default=str)
+        about = obj.id, obj.name, obj.digest, obj.transform, obj.bounds, described, obj.revision
+        digests.add(f"{name}/object {obj.id}", f"{obj.voxels} voxels", *about, env.voxels(obj.id))
+    digests.add(f"{name}/quantiles", "", env.quantiles().bounds)
+    with tempfile.TemporaryDirectory() as folder:
+        if "://" in url:
+            hapticdb.copy_environment(url, url := str(Path(folder, "copy.db")))
+        with contextlib.closing(sqlite3.connect(f"file:{url}?mode=ro", uri=True)) as db:
+            rows = [repr(row) for row in db.execute(f"SELECT * FROM {table} ORDER BY z_val, id")]
+    digests.add(f"{name}/rows", f"{len(rows)} rows", "\n".join(rows))
+
+
+def touched(
+    digests: Digests,
+    name: str,
+    env: hapticdb.Environment,
+    shell: hapticdb.PointShell,
+    poses: NDArray[np.float64],
 ) -> None:
-    """Compute all entries on these environments."""
-    tool = sample_tool(folder, places[0], n_poses)
-    (digest := Digest()).feed(tool.shell.points, tool.shell.normals, tool.shell.center, tool.poses)
-    results["tool and poses"] = digest.entry(len(tool.poses), "poses")
-    recordings = recordings_of(places, given)
-    for place in places:
-        own = folder.with_name(f"{folder.name}-{place.name}.rec")
-        with hapticdb.open(place.url, read_only=True) as env:
-            stored(place, env, results)
-            touched(place, env, tool, results)
-            if not given or place.name in recordings:
-                file = recordings.get(place.name) or recorded(place, tool, own)
-                replayed(place, env, file, results)
-            swept(place, tool, results)
-        if place != places[0]:
-            found = command("diff", places[0].url, place.url)
-            (digest := Digest()).feed(found["objects"], found["voxels"])
-            results[f"{place.name}/diff"] = digest.entry(
-                found["voxels"], "voxels", int(not found["is_equal"])
-            )
+    """Touches at all poses, by each strategy and all at once."""
+    for strategy in STRATEGIES:
+        all_ = [env.touch(shell, pose, strategy) for pose in poses]
+        felt = [(one.force, one.torque, one.hits, one.depths, one.contacts, one.pairs,
+                 np.array([obj.id for obj in one.objects], np.int64)) for one in all_]  # fmt: skip
+        n_hit = sum(len(one.hits) > 0 for one in all_)
+        flat = [value for one in felt for value in one]
+        digests.add(f"{name}/{strategy}", f"{n_hit} of {len(poses)} hit", *flat)
+        if strategy not in MEASURED:
+            asked = [(one.query.statements, one.query.ranges, one.query.rows) for one in all_]
+            digests.add(f"{name}/{strategy} queries", "", asked)
+    many = env.touch(shell, poses=poses, objects=True)
+    values = many.forces, many.torques, many.hits, many.n_contacts, many.deepest
+    digests.add(f"{name}/at once", f"{len(many)} poses", *values, many.ids, many.offsets)
 
 
-def versions() -> dict[str, str]:
-    """Versions of the code, Python and numpy: printed, not compared."""
-    source = Path(hapticdb.__file__).parent
-    asked = ["git", "-C", str(source), "describe", "--always", "--dirty"]
-    commit = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
-    return {
-        "commit": commit.stdout.strip(),
-        "source": str(source),
-        "Python": platform.python_version(),
-        "numpy": np.__version__,
-    }
-
-
-def compare(sides: Sequence[Path]) -> int:
-    """Print how two files differ; return 1 if any entry is different, missing, wrong or empty."""
-    a, b = (json.loads(path.read_text(encoding="utf-8")) for path in sides)
-    for letter, side in zip("AB", (a, b), strict=True):
-        print(letter, *(f"{name} {value}" for name, value in side["versions"].items()))
-    n_wrong = 0
-    for name in a["entries"] | b["entries"]:
-        ours, theirs = a["entries"].get(name), b["entries"].get(name)
-        one = ours or theirs
-        if ours is None or theirs is None:
-            verdict = f"ONLY IN {'A' if theirs is None else 'B'}"
-        elif ours != theirs:
-            verdict = "DIFFERENT"
-        elif ours["differing"]:
-            verdict = "WRONG IN BOTH"
-        else:
-            verdict = "same" if ours["n"] else "NOTHING COMPARED"
-        n_wrong += verdict != "same"
-        print(f"{name:36} {one['n']:>9} {one['of']:36} {verdict}")
-    n_all = len(a["entries"] | b["entries"])
-    print(f"{n_all - n_wrong} of {n_all} the same")
-    return int(n_wrong > 0 or n_all == 0)
+def digests_of(folder: Path, first: Path, *, is_quick: bool, count: int) -> Digests:
+    """All digests of this tree; first : folder of the tree that records the sessions."""
+    digests, folder = Digests(), folder.resolve()
+    sample = write_sample(folder / "sample")
+    car = records.data("demo_vintage_car/vintage_car.glb") or sample.car
+    grid = hapticdb.GridOptions(bits=9 if is_quick else 11, extent=1.6)
+    for name, url, layout in places(folder, is_quick=is_quick):
+        options = hapticdb.ImportOptions(grid=grid, layout=layout, distances=False)
+        (report,) = hapticdb.import_files(url, [car], options)
+        if report.error is not None:
+            raise report.error
+        mesh, path = write_along(folder / name, url, 1000)
+        shell, slide = hapticdb.PointShell.from_file(mesh, 300), hapticdb.read_poses(path)
+        hand, recording = folder / "hand.csv", first / f"{name}.rec"
+        hapticdb.write_poses(hand, slide[HAND])
+        with hapticdb.open(url, read_only=True) as env:
+            poses = chosen_poses(env, shell, slide, count)
+            digests.add(f"{name}/shell", "", shell.points, shell.normals, shell.center, poses)
+            stored(digests, name, env, url, layout)
+            touched(digests, name, env, shell, poses)
+            if folder == first:
+                words = "--tool", mesh, "--device", hand, *SESSION.split(), recording
+                command("feel", url, *words)
+            found = hapticdb.replay(hapticdb.Recording(recording), env)
+            digests.add(f"{name}/replay", f"{found.n_frames} frames", found.n_differing)
+        told = command("replay", recording, url)
+        digests.add(f"{name}/replay by the verb", f"{told['frames']} frames", told["differing"])
+        swept = command("sweep", url, "--tool", mesh, "--path", path)
+        kept = {key: swept[key] for key in swept.keys() - {"elapsed", "moved", "path"}}
+        digests.add(f"{name}/sweep", swept["line"], json.dumps(kept, sort_keys=True))
+        if found.n_differing or told["differing"]:
+            raise SystemExit(f"{name}: {found.n_differing} frames of the replay differ")
+    return digests
 
 
 def main() -> int:
-    """Read the command line; compare, or measure and write."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("folder", type=Path, nargs="?", help="for databases; kept")
-    parser.add_argument("--out", type=Path, help="JSON to write")
-    parser.add_argument("--replay", type=Path, nargs="+", default=[], help="recordings to feel")
+    """Run both trees and compare, or be one of them."""
+    parser = argparse.ArgumentParser(description=records.first_line(__doc__))
+    parser.add_argument("--before", type=Path, default=records.ROOT / "src", help="other tree")
     parser.add_argument("--poses", type=int, default=1000, help="poses of a touch")
-    parser.add_argument("--quick", action="store_true", help="bricks on SQLite alone: a minute")
-    parser.add_argument("--compare", type=Path, nargs=2, metavar="JSON", help="of two commits")
-    chosen = parser.parse_args()
-    if chosen.compare:
-        return compare(chosen.compare)
-    if chosen.folder is None or chosen.out is None:
-        parser.error("give a folder and --out, or --compare")
-    folder, results = chosen.folder.resolve(), Results(chosen.out, versions())
-    folder.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as servers:
-        places = import_car(folder, servers, is_quick=chosen.quick)
-        measure(folder, places, chosen.replay, chosen.poses, results)
-    return int(any(entry["differing"] or not entry["n"] for entry in results.values()))
+    parser.add_argument("--quick", action="store_true", help="bricks on SQLite, 9 bits: a minute")
+    parser.add_argument("--folders", nargs=2, type=Path, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.folders:
+        print(json.dumps(digests_of(*given.folders, is_quick=given.quick, count=given.poses)))
+        return 0
+    sides: list[dict[str, list[str]]] = []
+    with tempfile.TemporaryDirectory() as name:
+        first = Path(name, "before").resolve()
+        for word, tree in (("before", given.before), ("after", records.ROOT / "src")):
+            (own := first.with_name(word)).mkdir()
+            line = [*sys.orig_argv, "--folders", str(own), str(first)]
+            variables = os.environ | {"PYTHONPATH": str(tree.resolve())}
+            done = subprocess.run(
+                line, env=variables, check=True, stdout=subprocess.PIPE, timeout=LONGEST_S
+            )
+            sides.append(json.loads(done.stdout))
+    before, after = sides
+    names = before | after
+    wrong = [each for each in names if before.get(each) != after.get(each)]
+    for each in wrong:
+        print(f"DIFFERENT {each}: {before.get(each)} and {after.get(each)}")
+    print(f"{len(names) - len(wrong)} of {len(names)} the same")
+    return int(bool(wrong))
 
 
 if __name__ == "__main__":

@@ -7,8 +7,6 @@ The walk is over the vintage car in the folder that HAPTICDB_TEST_DATA names; ov
 where there is none.
 """
 
-import argparse
-import os
 import sys
 import tempfile
 import time
@@ -26,9 +24,9 @@ import page_tables
 import records
 from awake import awake
 from feel import sliding, stability, touching, walking
+from feel.ground import N_RANDOM
 from feel.measures import table_of
-from feel.person import DEVICE_DAMPING, DEVICE_KG, FIRM, LIGHT
-from feel.scenes import N_RANDOM
+from feel.stability import DEVICE_DAMPING, DEVICE_KG, FIRM, LIGHT
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.sample import write_sample
 
@@ -92,11 +90,10 @@ def measure(effort: Effort, place: Path, model: Path) -> tuple[list[Record], lis
         draw("depth", law.name, touching.depth_curves(law, place))
         keep(law.name, **slides)
     say("sessions on planes")
-    keep("distance", session_ripple=sliding.ripple_of_sessions(place, effort.n_random))
+    keep("distance", **sliding.on_planes(place, effort.n_random))
     force, pressed = sliding.force_of_sessions(place)
     draw("press", "distance", pressed)
     keep("distance", session_force=force)
-    keep("distance", session_enter=sliding.step_on_entering(place, effort.n_random))
     say("sessions round an edge")
     edges, rounded = sliding.edge_of_sessions(place)
     draw("edge", "distance", rounded)
@@ -152,22 +149,17 @@ def inputs_of(effort: Effort, model: Path) -> dict[str, str]:
 
 def main() -> None:
     """Measure, write JSON and plot, and fill the page's tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="fewer cases, for a first look")
-    given = parser.parse_args()
-    out = Path("results-quick" if given.quick else "results")
-    effort = QUICK if given.quick else Effort()
+    is_quick, out = records.asked(__doc__, "fewer cases, for a first look")
+    effort = QUICK if is_quick else Effort()
     with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-feel-") as folder:
-        model = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), CAR)
-        if not model.is_file():
-            model = write_sample(Path(folder)).car
+        model = records.data(CAR) or write_sample(Path(folder)).car
         scenes = Path(folder, "scenes")
         scenes.mkdir()
         cells, curves = measure(effort, scenes, model)
     found = records.result("feel", cells, inputs_of(effort, model)) | {"curves": curves}
     records.write(out, {"feel": found})
     plot(curves, out / "feel.svg")
-    page_tables.refill("docs/feel.md", out, out / "feel.md" if given.quick else None)
+    page_tables.refill("docs/feel.md", out, out / "feel.md" if is_quick else None)
     print(table_of(cells))
 
 

@@ -1,30 +1,16 @@
 """Measures of `touch`: the force of a frame while a tool moves over closed forms."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from feel.couplings import posed
-from feel.figures import largest_step, ripple
-from feel.ground import Ground
-from feel.scenes import (
-    FILLING,
-    Scene,
-    planes,
-)
-from feel.tools import flat_tool
+from feel.ground import FILLING, SIZE, Floats, Ground, Scene, Stand, flat_tool, planes, posed
+from feel.hands import largest_step, ripple
 from hapticdb.kernels.field.distance_law import ONSET
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 
-Floats = NDArray[np.float64]
-
-SIZE = 0.005
-"""Voxel size, metres."""
 STIFFNESS = 1000.0
 """K of the laws, N/m."""
 DEPTHS = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8)
@@ -41,8 +27,7 @@ SHOWN = ("0 degrees", "20 degrees", "45 degrees")
 """Planes whose force against depth is drawn."""
 
 
-@dataclass(frozen=True)
-class Law:
+class Law(NamedTuple):
     """A law of `touch`.
 
     onset : voxels before the surface at which contact begins; layers : depths of the sheets of a
@@ -66,12 +51,8 @@ DISTANCE = Law("distance", ONSET, (0.0,), DistanceField(STIFFNESS), distances=Tr
 
 def slide_poses(ground: Ground, scene: Scene, height: float) -> Floats:
     """Poses (M, 4, 4) of a slide, askew to the axes, at a height in voxels over a plane."""
-    ways = np.arange(0.0, SLIDE * SIZE, APART)
-    x, y, z = scene.axes.T
-    along = np.cos(np.pi / 6) * x + np.sin(np.pi / 6) * y
-    poses = np.tile(posed(ground.origins[scene.name] + height * SIZE * z), (len(ways), 1, 1))
-    poses[:, :3, 3] += ways[:, None] * along
-    return poses
+    stand = Stand(ground.origins[scene.name] + height * SIZE * scene.axes[:, 2], scene.axes)
+    return np.stack([posed(stand.at(0.0, way)) for way in np.arange(0.0, SLIDE * SIZE, APART)])
 
 
 def slides_of_touch(law: Law, folder: Path, n_random: int) -> dict[str, dict[str, Any]]:
@@ -79,7 +60,7 @@ def slides_of_touch(law: Law, folder: Path, n_random: int) -> dict[str, dict[str
     scenes = planes(law.layers, n_random)
     rows: list[dict[str, Any]] = []
     curve: list[float] = []
-    with Ground.of_scenes(folder, scenes, SIZE, distances=law.distances) as ground:
+    with Ground.of_scenes(folder, scenes, distances=law.distances) as ground:
         for scene in scenes:
             for across in ACROSS:
                 shell = flat_tool(across, SIZE, scene.axes)
@@ -91,24 +72,20 @@ def slides_of_touch(law: Law, folder: Path, n_random: int) -> dict[str, dict[str
                     rows.append(row | {"ripple": ripple(normal), "step": largest_step(forces)})
                     if (scene.name, across, depth) == ("20 degrees", 3, 0.5):
                         curve = normal.tolist()
-    ripples = [worst_ripple(r["ripple"] for r in rows if r["points"] == n**2) for n in ACROSS]
+    ripples = [
+        max(row["ripple"] for row in rows if row["points"] == n**2 and row["ripple"] < np.inf)
+        for n in ACROSS
+    ]
+    steps = [
+        max(row["step"] for row in rows if row["depth"] <= depth) for depth in (SHALLOW, DEPTHS[-1])
+    ]
     n_without = sum(row["ripple"] == np.inf for row in rows)
     ways = (np.arange(len(curve)) * APART * 1e3).tolist()
     return {
         "touch_ripple": {"values": ripples, "without_force": n_without, "slides": len(rows)},
-        "touch_step": {"values": [step_to(rows, SHALLOW), step_to(rows, DEPTHS[-1])]},
+        "touch_step": {"values": steps},
         "curve": {"label": "20 degrees, 9 points, depth 0.5 voxels", "x": ways, "y": curve},
     }
-
-
-def step_to(rows: Iterable[dict[str, Any]], depth: float) -> float:
-    """Largest step of all slides down to a depth in voxels."""
-    return max(float(row["step"]) for row in rows if row["depth"] <= depth)
-
-
-def worst_ripple(ripples: Iterable[float]) -> float:
-    """Largest finite ripple; a slide without force has none."""
-    return max(value for value in ripples if value < np.inf)
 
 
 def depth_curves(law: Law, folder: Path) -> list[dict[str, Any]]:
@@ -116,7 +93,7 @@ def depth_curves(law: Law, folder: Path) -> list[dict[str, Any]]:
     scenes = [scene for scene in planes(law.layers, 0) if scene.name in SHOWN]
     depths = np.linspace(-0.5, 2.0, 251)
     curves = []
-    with Ground.of_scenes(folder, scenes, SIZE, distances=law.distances) as ground:
+    with Ground.of_scenes(folder, scenes, distances=law.distances) as ground:
         for scene in scenes:
             z = scene.axes[:, 2]
             origin = ground.origins[scene.name]

@@ -1,22 +1,17 @@
 """A walk over a model: one path of the hand, and the force on it."""
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from feel.couplings import RATE, CoupledHand, Terms, drive, posed, straight
-from feel.figures import largest_step
-from feel.ground import Ground
-from feel.tools import ball
+from feel.ground import Floats, Ground
+from feel.hands import RATE, CoupledHand, largest_step, straight
 from hapticdb.environment import Environment
 from hapticdb.kernels.field.distance_law import ONSET
+from hapticdb.pointshell.shell import PointShell
 from slide_paths import slide_along
-
-Floats = NDArray[np.float64]
 
 RADIUS = 12.0
 """Radius of the ball that walks, voxels."""
@@ -42,8 +37,7 @@ NEAR = 48.0
 """Voxels around the path whose cells are fetched."""
 
 
-@dataclass(frozen=True)
-class Walk:
+class Walk(NamedTuple):
     """A hand's way over a model.
 
     hand (M, 3): positions, metres, one a period; speed, m/s; voxel_size, metres.
@@ -57,7 +51,7 @@ class Walk:
 def plan_walk(env: Environment, places: int = PLACES) -> Walk:
     """A path over the model's largest objects, pressed in and smoothed."""
     size = env.grid.voxel_size
-    shell = ball(RADIUS, size, POINTS)
+    shell = PointShell.sphere(RADIUS * size, POINTS)
     raw = slide_along(env, shell.points, places)[:, :3, 3]
     smooth = gaussian_filter1d(raw, SMOOTHING, axis=0, mode="nearest")
     smooth[:, 2] -= PRESS
@@ -83,27 +77,23 @@ def descent(env: Environment, walk: Walk) -> Floats:
 
 def walk_over(url: str | Path, places: int = PLACES) -> tuple[dict[str, Any], dict[str, Any]]:
     """Walk over an environment: figures, and the force over time."""
-    with Ground(url, distances=True) as ground:
+    with Ground(url) as ground:
         walk = plan_walk(ground.environment, places)
         lead = descent(ground.environment, walk)
         apart = max(round(16.0 * ground.size / (walk.speed / RATE)), 1)
         for place in np.concatenate([lead[::apart], walk.hand[::apart]]):
             ground.fetch(place, NEAR)
-        shell = ball(RADIUS, ground.size, POINTS)
+        shell = PointShell.sphere(RADIUS * ground.size, POINTS)
         above = np.array([0.0, 0.0, ONSET * ground.size])
-        hand = CoupledHand(ground, shell, posed(lead[0] + above), Terms())
-        drive(hand, lead + above)
-        return _figures_of(drive(hand, walk.hand + above).forces)
-
-
-def _figures_of(forces: Floats) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Figures of the forces (M, 3) of a walk, and their size over time."""
+        hand = CoupledHand(ground, shell, lead[0] + above)
+        hand.lead(lead + above)
+        forces = hand.lead(walk.hand + above)
     sizes = np.linalg.norm(forces, axis=1)
     every = max(len(sizes) // MOST_DRAWN, 1)
     times = (np.arange(len(sizes)) / RATE)[::every].tolist()
-    mean, peak = float(sizes.mean()), float(sizes.max())
-    figures = {"values": [largest_step(forces), trembling(forces)], "mean": mean, "peak": peak}
-    return figures, {"label": "force", "x": times, "y": sizes[::every].tolist()}
+    found: dict[str, Any] = {"values": [largest_step(forces), trembling(forces)]}
+    found |= {"mean": float(sizes.mean()), "peak": float(sizes.max())}
+    return found, {"label": "force", "x": times, "y": sizes[::every].tolist()}
 
 
 def trembling(forces: Floats) -> float:

@@ -1,15 +1,14 @@
-"""The coupling of the distance law, period by period in this process.
+"""The coupling of the distance law, period by period in this process, and figures of its forces.
 
 No loop, no clock and no device: a measure gives the hand's place and reads the force.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from feel.ground import Ground
+from feel.ground import Floats, Ground, Stand, flat_tool, posed
 from hapticdb.devices.handle import Handle
 from hapticdb.devices.protocol import Reading
 from hapticdb.kernels.hand.device_spring import DeviceSpring
@@ -19,12 +18,14 @@ from hapticdb.query.law import DISTANCE
 from hapticdb.resident.point_runs import clusters_of
 from hapticdb.session.states import PeriodClock, SessionState
 
-Floats = NDArray[np.float64]
-
 STIFFNESS = 1000.0
 """Stiffness at the device, N/m, where a measure names no other."""
 RATE = 1000.0
 """Periods a second, where a measure names no other."""
+SPEED = 0.05
+"""Speed of a sliding hand, m/s: 0.05 mm a period."""
+ABOVE = 0.002
+"""Height above the onset from which a hand comes, metres."""
 CAP = 20.0
 """Most force of the distance law's device, N: above all that is wanted of it here. Larger: stiffer
 contacts in its coupling."""
@@ -33,8 +34,7 @@ REST = 40
 session at a higher rate has risen, too; each measure takes longer."""
 
 
-@dataclass(frozen=True)
-class Terms:
+class Terms(NamedTuple):
     """Terms of a session.
 
     stiffness, N/m, at the device; rate: periods a second; delay: seconds from sending a force until
@@ -46,14 +46,20 @@ class Terms:
     delay: float = 0.0
 
 
+USUAL = Terms()
+
+
 class CoupledHand:
     """A hand with a tool that rests where forces balance, from one period to the next.
 
-    The tool is at rest at the pose (4, 4) of the device, and has been there for `REST` periods. The
-    damper cancels what delay gives, as in a session: B = K (T / 2 + t_d).
+    The tool is at rest at a position (3,) of the device, upright, and has been there for `REST`
+    periods. The damper cancels what delay gives, as in a session: B = K (T / 2 + t_d).
     """
 
-    def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
+    def __init__(
+        self, ground: Ground, shell: PointShell, start: Floats, terms: Terms = USUAL
+    ) -> None:
+        pose = posed(start)
         self._periods = PeriodClock(DISTANCE)
         self._state = SessionState(
             self._periods.slots[0, ...], ground.table.cells, 0, ground.table.queue.requests[0, ...],
@@ -83,45 +89,48 @@ class CoupledHand:
         for _ in range(round(REST / (self._period * RATE))):
             self.step(pose, np.zeros(6))
 
-    def step(self, pose: Floats, velocity: Floats) -> Floats:
-        """Force (3,) on the device after one period, N.
+    @classmethod
+    def above(
+        cls, ground: Ground, stand: Stand, across: int, terms: Terms = USUAL
+    ) -> "CoupledHand":
+        """With a flat tool, `ABOVE` the onset of contact."""
+        return cls(ground, flat_tool(across, ground.size, stand.axes), stand.at(-ABOVE), terms)
 
-        pose (4, 4) and velocity (6,): of the device, metres of the device; the array that is
-        returned is the caller's own.
+    def step(self, pose: Floats, velocity: Floats) -> Floats:
+        """Force (3,) on the device after one period, N; the caller's own array.
+
+        pose (4, 4) and velocity (6,): of the device, metres of the device.
         """
         self._handle.follow(Reading(pose, velocity, 0), self._hand)
         self._periods.step(self._period, 0)
         return np.array(self._sent["wrench"][:3])
 
-
-class Drive(NamedTuple):
-    """A hand's way: positions (M, 3) of the device, and forces (M, 3) on it."""
-
-    positions: Floats
-    forces: Floats
-
-
-def posed(position: Floats) -> Floats:
-    """Pose (4, 4), upright, at a position (3,)."""
-    pose = np.eye(4)
-    pose[:3, 3] = position
-    return pose
+    def lead(self, positions: Floats) -> Floats:
+        """Forces (M, 3) along positions (M, 3), one a period of 1 / `RATE` s, upright."""
+        velocities = np.zeros((len(positions), 6))
+        velocities[1:, :3] = np.diff(positions, axis=0) * RATE
+        pairs = zip(positions, velocities, strict=True)
+        return np.array([self.step(posed(place), velocity) for place, velocity in pairs])
 
 
-def drive(hand: CoupledHand, positions: Floats, rate: float = RATE) -> Drive:
-    """Lead a hand along positions (M, 3), one a period, upright."""
-    velocities = np.zeros((len(positions), 6))
-    velocities[1:, :3] = np.diff(positions, axis=0) * rate
-    forces = np.empty_like(positions)
-    pose = np.eye(4)
-    for n, (position, velocity) in enumerate(zip(positions, velocities, strict=True)):
-        pose[:3, 3] = position
-        forces[n] = hand.step(pose, velocity)
-    return Drive(positions, forces)
-
-
-def straight(start: Floats, end: Floats, speed: float, rate: float = RATE) -> Floats:
+def straight(start: Floats, end: Floats, speed: float = SPEED) -> Floats:
     """Positions (M, 3) from start to end, both included, at a speed in m/s."""
     way = float(np.linalg.norm(end - start))
-    count = max(round(way / speed * rate), 1)
+    count = max(round(way / speed * RATE), 1)
     return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * (end - start))
+
+
+def ripple(values: ArrayLike) -> float:
+    """Standard deviation over mean; infinite for values whose mean is 0 or less."""
+    array = np.asarray(values, dtype=np.float64)
+    mean = float(array.mean())
+    return float(array.std()) / mean if mean > 0.0 else float("inf")
+
+
+def largest_step(forces: Floats, apart: int = 1) -> float:
+    """Greatest change between forces (M, 3) that are at most `apart` samples apart."""
+    steps = [
+        np.linalg.norm(forces[n:] - forces[:-n], axis=1).max(initial=0.0)
+        for n in range(1, min(apart, len(forces) - 1) + 1)
+    ]
+    return float(max(steps, default=0.0))

@@ -2,20 +2,19 @@
 
     HAPTICDB_TEST_DATA=... python benchmarks/truth.py [--seconds 20]    # for each row
 
-coal measures triangles in millimetres. Tight-Inclusion (package ipctk) is asked in a Python of its
-own, `--ipctk`; without it, its row says so.
+coal measures in millimetres. Tight-Inclusion, OMPL (with coal) and build123d run in Pythons of
+their own; a row without one is left out.
 """
 
 import argparse
 import csv
 import json
-import os
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +31,13 @@ from hapticdb.mesh import read_file
 from hapticdb.pointshell.shape import bvh_of
 from hapticdb.pointshell.tool_surface import ToolSurface
 from test_mesh_proofs import bracket, clamp, coal_distance, tree_in_mm
+from truth_paths import machines, planned
+from truth_shapes import DATA, Case, in_contact, insides, pairs, step_fits
 
 Floats = NDArray[np.float64]
-DATA = Path(os.environ.get("HAPTICDB_TEST_DATA", "data"))
 POSES = 100
 """Places of a path at which coal measures."""
+PEERS = {"ipctk": "ipctk", "ompl": "ompl and coal", "step": "build123d"}
 TIGHT = """
 import json, sys, time, ipctk, numpy as np
 told, began = [], time.perf_counter()
@@ -47,14 +48,6 @@ for kind, p, d in json.load(sys.stdin):
     told.append(bool(f(*p, *q)[0]))
 json.dump([told, time.perf_counter() - began], sys.stdout)
 """
-
-
-class Case(NamedTuple):
-    """One answer beside an oracle's; deviation : of a proved gap below the oracle's, metres."""
-
-    said: str
-    is_wrong: bool
-    deviation: float = 0.0
 
 
 def pair_of(thing: Floats, tool: Floats, poses: Floats) -> Pair:
@@ -152,14 +145,24 @@ def main() -> None:
     """Measure, print, and fill the table of docs/evaluation.md."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--ipctk", default="", help="a Python that has ipctk")
+    for name in ("ipctk", "ompl", "step"):
+        parser.add_argument(f"--{name}", default="", help=f"a Python that has {PEERS[name]}")
     chosen = parser.parse_args()
     rows: list[dict[str, object]] = []
     oracles: dict[tuple[str, str], Callable[[float], Iterator[Case]]] = {
         ("open shapes past one another", "coal"): open_shapes,
+        ("sweeps in contact", "coal"): in_contact,
+        ("inside of closed bodies", "winding numbers"): insides,
+        ("inside of bodies with T-junctions", "winding numbers"): partial(insides, is_torn=True),
+        ("machines among boxes", "coal"): machines,
+        ("pairs of three assemblies", "coal"): pairs,
         ("M16 nut, a quarter turn", "coal"): nuts,
         ("round pegs drawn out", "nominal gap"): pegs,
     }
+    if chosen.step:
+        oracles["shafts in STEP files", "nominal gap"] = partial(step_fits, chosen.step)
+    if chosen.ompl:
+        oracles["OMPL's valid paths", "coal"] = partial(planned, chosen.ompl)
     for (what, oracle), cases in oracles.items():
         began = time.perf_counter()
         found = list(cases(time.monotonic() + chosen.seconds))
@@ -168,15 +171,18 @@ def main() -> None:
             row[f"wrong_{said}"] = sum(one.is_wrong and one.said == said for one in found)
         row["undecided"] = sum(one.said not in {"clear", "hit"} for one in found)
         row["gap_below_m"] = max(one.deviation for one in found)
+        row["said_hit"] = sum(one.said == "hit" for one in found)
         rows.append(row | {"s": time.perf_counter() - began})
+        print(rows[-1], flush=True)
     for name, truth, told, took in ccd(chosen.ipctk, time.monotonic() + chosen.seconds):
-        pairs = [*zip(truth, told, strict=False)]
-        row = {"what": f"CCD of shifts, {name}", "oracle": "exact", "cases": len(pairs)}
-        row["wrong_clear"] = sum(is_hit and not one for is_hit, one in pairs)
-        row["wrong_hit"] = sum(one and not is_hit for is_hit, one in pairs)
+        both = [*zip(truth, told, strict=False)]
+        row = {"what": f"CCD of shifts, {name}", "oracle": "exact", "cases": len(both)}
+        row["wrong_clear"] = sum(is_hit and not one for is_hit, one in both)
+        row["wrong_hit"] = sum(one and not is_hit for is_hit, one in both)
         rows.append(row | {"undecided": 0, "gap_below_m": None, "s": took})
-    if not chosen.ipctk:
-        print("Tight-Inclusion was not asked: --ipctk names a Python that has it")
+    for name, package in PEERS.items():
+        if not getattr(chosen, name):
+            print(f"left out: --{name} names a Python that has {package}")
     found_all = records.conditions() | {"inputs": {"seconds": chosen.seconds}, "rows": rows}
     print(page_tables.truth({"truth": found_all}))
     records.write(Path("results"), {"truth": found_all})

@@ -194,8 +194,10 @@ def truth(results: Results) -> str:
     names = ("what", "oracle", "cases", "wrong_clear", "wrong_hit", "undecided")
     rows = []
     for row in results["truth"]["rows"]:
-        below = row["gap_below_m"]
-        rows.append([*(f"{row[name]}" for name in names), us_text(below and 1e6 * below)])
+        below, hits = row["gap_below_m"], f", {row.get('said_hit')} collide"
+        told = [f"{row[name]}" for name in names]
+        told[0] += hits if "OMPL" in told[0] else ""
+        rows.append([*told, us_text(below and 1e6 * below)])
     return table(head, rows)
 
 

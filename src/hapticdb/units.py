@@ -38,6 +38,8 @@ _LENGTH = re.compile(
 """A finite number, and an optional unit."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
 """Units of printed lengths: metres, sign, and the least number printed in it."""
+_LIKELY = ("mm", "in", "cm", "um", "ft")
+"""Likely units of a tool with an implausible size in metres, the likeliest first."""
 _VOLUMES = ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³"))
 
 
@@ -46,6 +48,19 @@ def length_text(length: float) -> str:
     found = (pair[:2] for pair in _READABLE if length >= pair[2] * pair[0])
     size, word = next(found, (1e-6, "µm"))
     return f"{length / size:.4g} {word}"
+
+
+def unit_doubt(length: float, extent: float, voxel_size: float) -> str:
+    """Note on a tool, metres, longer than a scene or shorter than a voxel; empty if plausible."""
+    if length > extent:
+        compared = f"longer than the scene ({length_text(extent)})"
+    elif length < voxel_size:
+        compared = f"shorter than a voxel ({length_text(voxel_size)})"
+    else:
+        return ""
+    unit = next((u for u in _LIKELY if voxel_size <= length * UNITS[u] <= extent), None)
+    hint = "is --tool-unit right?" if unit is None else f"would --tool-unit {unit} be right?"
+    return f"{length_text(length)} long, {compared}: {hint}"
 
 
 def place_text(place: Iterable[float], step: float) -> str:

@@ -1,9 +1,11 @@
 """Tools of the page: built-in probes, shells in any frame, and where they start."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from hapticdb import PointShell
 from hapticdb.errors import UsageError
@@ -53,6 +55,19 @@ def test_from_shell_convex_hull() -> None:
     flat = PointShell(np.eye(3), np.eye(3), np.zeros(3))
     with pytest.raises(UsageError, match="mesh"):
         tools.from_shell("flat", flat)
+
+
+@pytest.mark.parametrize(("unit", "notes"), [(None, 1), ("m", 0), ("mm", 0)])
+def test_from_files_unit(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, unit: str | None, notes: int
+) -> None:
+    trimesh.creation.box((60.0, 6.0, 6.0)).export(tmp_path / "probe.stl")
+    (held,) = tools.from_files(
+        [str(tmp_path / "probe.stl")], VOXEL, has_distances=True, unit=unit, extent=0.24
+    )
+    assert np.ptp(held.vertices[:, 0]) == pytest.approx(0.06 if unit == "mm" else 60.0)
+    text = "the tool probe.stl is 60 m long, longer than the scene (0.24 m): would --tool-unit mm"
+    assert [text in record.message for record in caplog.records] == [True] * notes
 
 
 @pytest.mark.parametrize("up", [0, 1, 2])

@@ -122,6 +122,7 @@ feel.processor N: Bind the loop to that processor.
 feel.no_baseline: Skip the empty loop that is measured before, for 2 s at most.
 
 view.tool FILE: Mesh of a tool to choose from, beside a ball and a peg.
+view.tool_unit: Unit of tools whose files name no unit; metres unless given.
 view.rendering [coupled where there are distances]: coupled: a spring between hand and tool, which
   stays outside of surfaces; needs distances. direct: the wrench of each frame, capped.
 view.recordings FOLDER: Folder in which people's sessions may be recorded.

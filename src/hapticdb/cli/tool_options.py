@@ -7,16 +7,13 @@ from typing import TYPE_CHECKING
 from hapticdb.cli import render
 from hapticdb.cli.options import UnitName
 from hapticdb.errors import UsageError
-from hapticdb.units import UNITS, length_text
+from hapticdb.units import length_text, unit_doubt
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.pointshell.shell_cache import Tool
     from hapticdb.query.law import LawName
-
-LIKELY = ("mm", "in", "cm", "um", "ft")
-"""Likely units of a tool with an implausible size in metres, the likeliest first."""
 
 
 @dataclass(frozen=True)
@@ -82,17 +79,9 @@ def warn_of_size(env: "Environment", tool: "Tool", excluded: Iterable[int]) -> N
     scene = scene_bounds(obj for obj in env.objects() if obj.id not in gone)
     if tool.shell.has_unit or scene is None:
         return
-    length, extent = tool.length, float(np.ptp(scene, axis=0).max())
-    if length > extent:
-        compared = f"longer than the scene ({length_text(extent)})"
-    elif length < env.grid.voxel_size:
-        compared = f"shorter than a voxel ({length_text(env.grid.voxel_size)})"
-    else:
-        return
-    fits = (u for u in LIKELY if env.grid.voxel_size <= length * UNITS[u] <= extent)
-    unit = next(fits, None)
-    hint = "is --tool-unit right?" if unit is None else f"would --tool-unit {unit} be right?"
-    render.note(f"the tool is {length_text(length)} long, {compared}: {hint}")
+    doubt = unit_doubt(tool.length, float(np.ptp(scene, axis=0).max()), env.grid.voxel_size)
+    if doubt:
+        render.note(f"the tool is {doubt}")
 
 
 def shell_text(shell: "PointShell") -> str:

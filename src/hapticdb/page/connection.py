@@ -52,9 +52,10 @@ class PageRequest(NamedTuple):
     """Arguments of the page process.
 
     urls : the environment's address for each role, whose rights the database enforces; tools :
-    files, the first is the initial tool; server, host : descriptors of the sockets to the server
-    (this module) and to the `SessionHost`; secret : of the server's connections; recordings : a
-    folder, or None; is_direct : direct rendering for all hands, without virtual coupling.
+    files, the first is the initial tool; tool_unit : as of `read_file`; server, host : descriptors
+    of the sockets to the server (this module) and to the `SessionHost`; secret : of the server's
+    connections; recordings : a folder, or None; is_direct : direct rendering for all hands, without
+    virtual coupling.
     """
 
     urls: Mapping[str, str]
@@ -66,6 +67,7 @@ class PageRequest(NamedTuple):
     title: str = ""
     is_direct: bool = False
     machine: MachineFiles | None = None
+    tool_unit: str | None = None
 
 
 class Visitor(NamedTuple):

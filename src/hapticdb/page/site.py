@@ -108,7 +108,13 @@ class Site:
             obj.has_distances for obj in self.objects.values()
         )
         self.tools = [
-            *tools.from_files(request.tools, facts.voxel_size, has_distances=facts.has_distances),
+            *tools.from_files(
+                request.tools,
+                facts.voxel_size,
+                has_distances=facts.has_distances,
+                unit=request.tool_unit,
+                extent=float(np.ptp(facts.bounds, axis=0).max()),
+            ),
             *tools.built_in(facts.diagonal, facts.voxel_size, has_distances=facts.has_distances),
         ]
         self.machine: tuple[Machine, Floats] | None = None

@@ -3,6 +3,7 @@
 The origin of each is the centre of its AABB, also of its gizmo.
 """
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,9 @@ from hapticdb.errors import FileError, UsageError
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import inset_of
+from hapticdb.units import unit_doubt
 
+LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
 
 LEAST_VOXELS = 3.0
@@ -77,19 +80,30 @@ def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list
     return found
 
 
-def from_files(paths: Sequence[str], voxel_size: float, *, has_distances: bool) -> list[PageTool]:
-    """Tools of the operator's files, by the files' names; FileError without a surface."""
+def from_files(
+    paths: Sequence[str], voxel_size: float, *, has_distances: bool, unit: str | None = None,
+    extent: float = math.inf,
+) -> list[PageTool]:  # fmt: skip
+    """Tools of the operator's files, by the files' names; FileError without a surface.
+
+    unit : as of `read_file`; unless it or the file gives one, the log has a note on a tool longer
+    than `extent`, metres, or shorter than a voxel.
+    """
     inset = inset_of(voxel_size, "distance" if has_distances else "plane")
     found = []
     for path in map(Path, paths):
         if path.suffix.lower() == ".npz":
             found.append(from_shell(path.stem, PointShell.load(path)))
             continue
-        file = mesh.read_file(path)
+        file = mesh.read_file(path, unit=unit)
         parts = [part for part in file.parts if not part.is_cloud]
         if not parts:
             raise FileError(f"{path}: no triangles; a tool needs a surface")
         vertices = np.concatenate([part.triangles() for part in parts]).reshape(-1, 3)
+        length = float(np.ptp(vertices, axis=0).max())
+        doubt = "" if unit or file.names_unit else unit_doubt(length, extent, voxel_size)
+        if doubt:
+            LOG.warning("the tool %s is %s", path.name, doubt)
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         faces = np.arange(len(vertices)).reshape(-1, 3)
         sample = partial(_centred_shell, vertices, faces, inset, file.link)

@@ -104,6 +104,7 @@ def _page_request(serving: Serving, server: int, host: int, secret: str) -> Page
     return PageRequest(
         urls, serving.tools, server, host, secret, serving.recordings, serving.title,
         is_direct=serving.rendering == "direct", machine=serving.machine,
+        tool_unit=serving.tool_unit,
     )  # fmt: skip
 
 

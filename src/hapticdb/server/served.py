@@ -27,15 +27,16 @@ PREFIX = re.compile(r"(/[A-Za-z0-9_-]+)*")
 class Serving:
     """Settings of a server.
 
-    urls : the environment's URL for each role; tools : files; tokens : with their roles; open_role
-    : of clients without a token; port : 0 for a free one; prefix : path of the server behind a
-    proxy, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder of recorded
-    sessions, None without recording; rendering : as of `SessionHost`; page : function of the page's
-    process.
+    urls : the environment's URL for each role; tools : files; tool_unit : as of `read_file`; tokens
+    : with their roles; open_role : of clients without a token; port : 0 for a free one; prefix :
+    path of the server behind a proxy, such as ``/hapticdb``; certificate, key : files of TLS;
+    recordings : folder of recorded sessions, None without recording; rendering : as of
+    `SessionHost`; page : function of the page's process.
     """
 
     urls: Mapping[Role, str]
     tools: tuple[str, ...] = ()
+    tool_unit: str | None = None
     tokens: Mapping[str, Role] = field(default_factory=dict)
     open_role: Role | None = None
     host: str = "127.0.0.1"

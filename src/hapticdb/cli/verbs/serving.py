@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
-from hapticdb.cli.options import RenderingName
+from hapticdb.cli.options import RenderingName, UnitName
 from hapticdb.cli.root import ended_by_signals, exit_by
 from hapticdb.cli.values import pose_of
 from hapticdb.cli.verbs.sweeping import MachineOptions
@@ -24,6 +24,7 @@ class PageOptions:
     """Options of a page's contents and duration."""
 
     tool: list[str] | None = None
+    tool_unit: UnitName | None = None
     rendering: RenderingName | None = None
     recordings: str | None = None
     seconds: float | None = None
@@ -54,7 +55,7 @@ class PageOptions:
         if folder is not None and not Path(folder).is_dir():
             raise UsageError(f"--recordings {folder}: no such folder")
         return Serving(
-            urls=urls, tools=tuple(self.tool or ()), tokens=tokens,
+            urls=urls, tools=tuple(self.tool or ()), tool_unit=self.tool_unit, tokens=tokens,
             open_role=None if tokens else Role.EDITOR, rendering=self.rendering,
             title=f"{Path(redact(url).partition('?')[0]).stem} - hapticdb",
             recordings=None if folder is None else str(Path(folder).resolve()),

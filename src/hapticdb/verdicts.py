@@ -1,6 +1,6 @@
 """Kinds of pairs of surfaces, and verdicts of paths, with their exit statuses."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Self
 
@@ -70,10 +70,12 @@ class PathVerdict(StrEnum):
         return self.exit_status in {0, PathVerdict.OVERLAPS.exit_status}
 
 
-def exit_codes(verdicts: Iterable[PathVerdict]) -> str:
-    """Exit status of each verdict with its meaning, a sentence for help texts."""
+def exit_codes(verdicts: Sequence[PathVerdict], many: str = "") -> str:
+    """Exit status of each verdict with its meaning, for help texts; many : subject of a batch."""
     found = "; ".join(f"{one.exit_status} {one}, {one.line}" for one in verdicts)
-    return f"Exit codes: {found}."
+    codes = {one.exit_status for one in verdicts}
+    worst = " before ".join(str(code) for code in WORST if code in codes)
+    return f"Exit codes: {found}." + (f" {many} the worst: {worst}." if many else "")
 
 
 SWEEP_VERDICTS = (

@@ -10,10 +10,13 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from children import finished
+from hapticdb.cli.options import TEXTS
+from hapticdb.mesh.parse import READERS
 from hapticdb.store.postgres.connecting import link
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import ranges as sqlite_ranges
+from hapticdb.verdicts import EXTRACT_VERDICTS, REPORTED, SWEEP_VERDICTS
 from postgres_servers import Binaries, serving
 from servers import FOUND, SETTINGS, named
 
@@ -84,6 +87,27 @@ def test_docs_sql_equals_code() -> None:
     for module, constant, layout, text in shown:
         runs = getattr(CODE[module], constant)[layout]
         assert text.split() == runs.split()
+
+
+def test_docs_verdicts_and_kinds() -> None:
+    paths, clashes = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("paths", "clashes"))
+    rows = re.findall(r"^\| \*?([a-z ]+?)\*? \| (\d) \|", paths, re.MULTILINE)
+    shown = {(one, str(one.exit_status)) for one in (*SWEEP_VERDICTS, *EXTRACT_VERDICTS)}
+    assert set(rows) == shown
+    assert {*re.findall(r"^\| \*([a-z ]+)\* \|", clashes, re.MULTILINE)} >= {*REPORTED}
+
+
+def test_docs_formats() -> None:
+    """The README and the help of import name each format."""
+    readme = re.search(
+        r"^hapticdb import .*# or .*", (ROOT / "README.md").read_text(), re.MULTILINE
+    )
+    texts = readme[0] if readme else "", next(t for t in TEXTS.splitlines() if "import.files" in t)
+    for reader in {*READERS.values()}:
+        names = [suffix[1:] for suffix in READERS if READERS[suffix] == reader]
+        named = [re.search(rf"\b({'|'.join(names)})\b", one, re.IGNORECASE) for one in texts]
+        assert len(named) == 2, texts
+        assert all(named), names
 
 
 def test_docs_links_resolve() -> None:

@@ -7,8 +7,8 @@ import pytest
 
 from children import finished
 from draws import is_every
+from file_seeds import seeds
 from hapticdb.mesh import SUFFIXES
-from mutate_files import FORMATS
 
 SCRIPT = Path(__file__).parent.parent / "mutate_files.py"
 FILES = 6000 if is_every() else 600
@@ -22,5 +22,6 @@ def test_mutated_files_read_or_refused() -> None:
     assert f"{FILES:,} files" in ended.stdout
 
 
-def test_mutated_files_every_format() -> None:
-    assert set(SUFFIXES) < set(FORMATS)
+def test_seeds_every_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("HAPTICDB_TEST_DATA", raising=False)
+    assert [suffix for suffix in SUFFIXES if not seeds(suffix, tmp_path)] == []

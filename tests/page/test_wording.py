@@ -2,8 +2,10 @@
 
 import pytest
 
+from hapticdb.page.panels.sweeps import COLOURS
 from hapticdb.page.scene.names import assemblies_of, found_ids
 from hapticdb.page.wording import escaped, note_html, plain_name, rows_html, short_name
+from hapticdb.verdicts import WORST
 
 HOSTILE = '<img src=x onerror="alert(1)">&amp;</td><script>'
 
@@ -27,6 +29,10 @@ def test_short_name_both_ends() -> None:
     assert short.endswith("17")
     assert short_name("body/door", 34) == "body/door"
     assert short_name("left/door", 6) == "door"
+
+
+def test_sweep_colours_every_exit_status() -> None:
+    assert set(COLOURS) == set(WORST)
 
 
 def test_plain_name_one_line() -> None:

@@ -66,11 +66,9 @@ def read_file(
     Parsed in a child process of bounded memory and processor time: no file can crash or hang its
     reader.
 
-    path : GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); IFC (extra `ifc`); LAS, LAZ
-        (extra `pointcloud`). The suffix selects the format.
-    unit : one of `hapticdb.mesh.UNITS`, for a file without a unit of its own (OBJ, STL, PLY, OFF,
-        LAS, LAZ). By default that of the reference system of a LAS or LAZ file, or of a comment,
-        else metres.
+    path : its suffix, one of `hapticdb.mesh.SUFFIXES`, selects the format.
+    unit : one of `hapticdb.mesh.UNITS`, for a file without a unit of its own, such as OBJ or STL.
+        By default that of the reference system of a LAS or LAZ file, or of a comment, else metres.
     memory_limit : bytes for parsing; by default in proportion to the file, see `child.allowance`
     time_limit : seconds of processor time; by default in proportion to the file. A parser that
         waits is ended after ten times as long.

@@ -25,8 +25,7 @@ Angles go round the outward axis by the right-hand rule, from where the tool's x
 the scene's x, or y if the axis lies along x. Those between two steps are not decided. The gap is
 the greatest of the free angles, 20 mm at most, 0 where the tool slides.
 
-{exit_codes(REACH_VERDICTS)}
-Of several objects the worst: 1 before 3 before 0.
+{exit_codes(REACH_VERDICTS, "Several objects have")}
 
 Example: hapticdb reach car.db 'wheel_bolt*' --tool brace.stl --turn 90deg
 """

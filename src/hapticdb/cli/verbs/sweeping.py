@@ -62,8 +62,7 @@ contact (mm, or such as 0.2in). Several words in a cell stand with ; between.
 
 --envelope stores a closed surface around all that moves on the path as an object, for clashes.
 
-{exit_codes(SWEEP_VERDICTS)}
-A batch has the worst: 1 before 3 before 4 before 0.
+{exit_codes(SWEEP_VERDICTS, "A batch has")}
 
 Example: hapticdb sweep car.db --part 17 --path out.csv
 """

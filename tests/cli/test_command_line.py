@@ -5,7 +5,9 @@ import json
 import os
 import re
 import sys
+from collections.abc import Iterable
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,8 +17,15 @@ import step_files
 from children import child, finished
 from command_line import Run, boxes, command, poses, refused, succeeded
 from hapticdb import cli
+from hapticdb.cli import options
+from hapticdb.grid import CURVE_NAMES
 from hapticdb.mesh import Part
+from hapticdb.paper.strategies import STRATEGIES
+from hapticdb.query.law import LAWS
+from hapticdb.session.coupling import RENDERINGS
 from hapticdb.store import connect
+from hapticdb.store.base import LAYOUTS
+from hapticdb.units import UNITS
 
 VERBS = [verb.__name__.rstrip("_") for verb in cli.VERBS if verb not in cli.HIDDEN]
 HIDDEN = ("sample",)
@@ -31,6 +40,18 @@ def test_main_without_arguments_lists_verbs(run: Run) -> None:
         assert re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
     for verb in HIDDEN:
         assert not re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
+
+
+@pytest.mark.parametrize(
+    ("choices", "names"),
+    [
+        (options.StrategyName, STRATEGIES), (options.CurveName, CURVE_NAMES),
+        (options.LayoutName, LAYOUTS), (options.LawName, LAWS), (options.RenderingName, RENDERINGS),
+        (options.UnitName, UNITS),
+    ],
+)  # fmt: skip
+def test_options_choices_equal_library(choices: object, names: Iterable[str]) -> None:
+    assert set(get_args(choices)) == set(names)
 
 
 def test_main_help_example_for_each_verb(run: Run) -> None:

@@ -16,7 +16,6 @@ from command_line import Run, command, on_terminal, refused, succeeded
 from hapticdb.cli.session_report import note_cost
 from hapticdb.cli.values import size_of
 from hapticdb.errors import UsageError
-from hapticdb.query.law import LawName
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
 from hapticdb.session import coupling
@@ -96,18 +95,18 @@ def test_feel_recorded_then_replayed(run: Run, scene: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("n_points", "rate", "law", "told"),
+    ("n_points", "rate", "has_distances", "told"),
     [
-        (300, 1000.0, "distance", ""),
-        (20_000, 1000.0, "distance", "20,000 points near a surface takes about 12 ms"),
-        (300, 20_000.0, "plane", ""),
-        (20_000, 5000.0, "plane", "takes about 1 ms, and 5,000 Hz leave 0.2 ms"),
+        (300, 1000.0, True, ""),
+        (20_000, 1000.0, True, "20,000 points near a surface takes about 12 ms"),
+        (300, 20_000.0, False, ""),
+        (20_000, 5000.0, False, "takes about 1 ms, and 5,000 Hz leave 0.2 ms"),
     ],
 )
 def test_note_cost_large_tool(
-    n_points: int, rate: float, law: LawName, told: str, capsys: pytest.CaptureFixture[str]
+    n_points: int, rate: float, has_distances: bool, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    note_cost(n_points, rate, law)
+    note_cost(n_points, rate, reads_distances=has_distances)
     said = capsys.readouterr().err
     assert told in said
     assert len(said.splitlines()) == bool(told)

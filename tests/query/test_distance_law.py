@@ -1,7 +1,8 @@
 """The distance law through `Environment.touch`: strategies, and its default."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import pytest
@@ -10,11 +11,14 @@ import hapticdb
 from hapticdb import DistanceField, Environment
 from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
+from hapticdb.kernels import force_law as kernels
+from hapticdb.kernels.field.distance_law import DistanceFieldLaw
 from hapticdb.kernels.field.packing import pack
 from hapticdb.paper.calibration import calibrate
 from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.paper.strategies import STRATEGIES
-from hapticdb.query.law import LAW_NAMES
+from hapticdb.query.law import LAWS, as_law, inset_of, law_named, reads_distances
+from hapticdb.session.coupling import rendering_of
 from hapticdb.store.base import Band, Keys, Rows
 from kernels.test_distance_law import expected, grid_of, merged, objects, random_pose, random_shell
 from naive_frame import NaiveTouch
@@ -83,7 +87,7 @@ def test_cbgroup_distance_law_row_cost(env: Environment) -> None:
     costs = CostModel(1.0, 1.0, 0.0, 1e-9, 1.0, distances=1e15)
     env.store.save_costs(machine_name(), costs.figures())
     with hapticdb.open(env.url) as reader:
-        plane, distance = (reader.touch(shell, pose, "cbgroup", law=law) for law in LAW_NAMES)
+        plane, distance = (reader.touch(shell, pose, "cbgroup", law=law) for law in LAWS.values())
     assert plane.query.ranges == 1
     assert distance.query.ranges > 1
     assert_same(distance, expected(merged(), shell, pose, []))
@@ -117,3 +121,28 @@ def test_touch_default_law_by_objects(env: Environment) -> None:
         env.touch(shell, poses=[pose], law="distance")
     with pytest.raises(UsageError, match="choose one of plane, distance"):
         env.touch(shell, pose, law="soft")  # type: ignore[call-overload]
+
+
+def test_law_named_every_law() -> None:
+    for name, law in LAWS.items():
+        assert as_law(name) is law  # type: ignore[arg-type]
+        assert law_named(name, 5.0) == replace(law, stiffness=5.0)
+
+
+class Numbers(NamedTuple):
+    """Numbers of a user's law on distances."""
+
+    stiffness: float
+
+
+class UsersLaw:
+    """A user's law on distances."""
+
+    stiffness, for_kernels = 5.0, Numbers(5.0)
+
+
+def test_reads_distances_users_law() -> None:
+    kernels.define(Numbers, kernels.LEAVES[DistanceFieldLaw])
+    assert reads_distances(UsersLaw())
+    assert inset_of(0.01, UsersLaw()) == inset_of(0.01, "distance") == 0.015
+    assert rendering_of(None, UsersLaw()) == "direct"

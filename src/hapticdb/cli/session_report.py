@@ -11,7 +11,6 @@ from hapticdb.tabular.schema import plain
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
-    from hapticdb.cli.options import LawName
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.session.prefetch.resident_cells import ResidentCells
     from hapticdb.session.report import Report
@@ -22,17 +21,17 @@ MOST_NAMED = 8
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "worst": "worst"}
 """Headings of the percentiles, and their fields in a `Spread`."""
 
-POINT_NS = {"plane": (50.0, 50.0), "distance": (100.0, 600.0)}
-"""Nanoseconds of a frame for each tool point near a surface, by law: in tools of up to `IN_CACHE`
-points, and in larger ones (57,600 points pressed on a plane, and results/realtime.json)."""
+POINT_NS = {False: (50.0, 50.0), True: (100.0, 600.0)}
+"""Nanoseconds of a frame for each tool point near a surface, without and with distances: in tools
+of up to `IN_CACHE` points, and in larger ones (57,600 on a plane, and results/realtime.json)."""
 IN_CACHE = 10_000
 
 Facts = list[tuple[str, str]]
 
 
-def note_cost(n_points: int, rate: float, law: "LawName", frames_on: str = "cpu") -> None:
+def note_cost(n_points: int, rate: float, frames_on: str = "cpu", *, reads_distances: bool) -> None:
     """Note the cost of a tool if its frames may exceed the period on a processor."""
-    seconds = 1e-9 * n_points * POINT_NS[law][n_points > IN_CACHE]
+    seconds = 1e-9 * n_points * POINT_NS[reads_distances][n_points > IN_CACHE]
     if rate > 0.0 and seconds > 1.0 / rate and frames_on == "cpu":
         render.note(
             f"a frame with all of the tool's {n_points:,} points near a surface takes about "

@@ -97,9 +97,10 @@ def define(law_type: type, leaves: Leaves) -> None:
     LEAVES[law_type] = leaves
 
 
-def reads_distances(law: Any) -> bool:  # noqa: ANN401 - a NamedTuple of a type of its own
-    """Whether the law's payload in a frame is the rows' distances."""
-    return LEAVES[type(law)].sample_rows is not _no_sample_of_rows
+def reads_distances(law: Any) -> bool:  # noqa: ANN401 - a NamedTuple, or its type
+    """Whether the payload in a frame of a law, or of a type of law, is the rows' distances."""
+    law_type = law if isinstance(law, type) else type(law)
+    return LEAVES[law_type].sample_rows is not _no_sample_of_rows
 
 
 respond = chosen_by_type(lambda law_type: LEAVES[law_type].respond)

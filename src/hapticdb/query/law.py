@@ -1,22 +1,21 @@
 """Force laws of the API (the paper, section 3); their arithmetic is in `kernels.force_law`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal, Protocol, get_args
+from typing import Any, ClassVar, Literal, Protocol
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels import force_law as kernels
 from hapticdb.kernels.field import distance_law as field
 
 LawName = Literal["plane", "distance"]
-LAW_NAMES: tuple[LawName, ...] = get_args(LawName)
 MOST_STIFFNESS = 1e9
 """Largest stiffness of a law, N/m: stiffer than any hand, device or part."""
 
 
-def inset_of(voxel_size: float, law: LawName) -> float:
+def inset_of(voxel_size: float, law: "ForceLaw | LawName") -> float:
     """Inward offset of a tool's points, metres, for contact to begin at its surface."""
-    return float(field.ONSET * voxel_size) if law == "distance" else 0.0
+    return float(field.ONSET * voxel_size) if reads_distances(law) else 0.0
 
 
 class ForceLaw(Protocol):
@@ -54,7 +53,7 @@ class TangentPlane(_Stiff):
     the law.
     """
 
-    name: ClassVar[str] = "plane"
+    name: ClassVar[LawName] = "plane"
 
     @cached_property
     def for_kernels(self) -> Any:  # noqa: ANN401 - kernels are loaded when they are first used
@@ -81,7 +80,7 @@ class DistanceField(_Stiff):
     The law needs distances of every object in the environment.
     """
 
-    name: ClassVar[str] = "distance"
+    name: ClassVar[LawName] = "distance"
 
     @cached_property
     def for_kernels(self) -> Any:  # noqa: ANN401 - likewise
@@ -91,24 +90,23 @@ class DistanceField(_Stiff):
 
 PLANE, DISTANCE = TangentPlane(), DistanceField()
 """The laws with their default stiffness."""
+LAWS: dict[str, TangentPlane | DistanceField] = {law.name: law for law in (PLANE, DISTANCE)}
+"""Laws chosen by a name, on the command line and in recordings."""
 
 
 def as_law(law: "ForceLaw | LawName | None") -> ForceLaw | None:
     """A law, or the one of that name; None stays None."""
-    if not isinstance(law, str):
-        return law
-    if law not in LAW_NAMES:
-        raise UsageError(f"law {law!r}: choose one of {', '.join(LAW_NAMES)}, or give a law")
-    return PLANE if law == PLANE.name else DISTANCE
+    return law_named(law) if isinstance(law, str) else law
 
 
-def law_named(name: str, stiffness: float) -> TangentPlane | DistanceField:
-    """Law of that name and stiffness, N/m; UsageError for others."""
-    if name not in LAW_NAMES:
-        raise UsageError(f"law {name!r}: this hapticdb has {', '.join(LAW_NAMES)}")
-    return TangentPlane(stiffness) if name == PLANE.name else DistanceField(stiffness)
+def law_named(name: str, stiffness: float | None = None) -> TangentPlane | DistanceField:
+    """Law of that name, with the stiffness, N/m, if given; UsageError for other names."""
+    if name not in LAWS:
+        raise UsageError(f"law {name!r}: choose one of {', '.join(LAWS)}")
+    return LAWS[name] if stiffness is None else replace(LAWS[name], stiffness=stiffness)
 
 
 def reads_distances(law: ForceLaw | LawName) -> bool:
     """Whether a law, or the law of that name, reads distances to surfaces."""
-    return law == DISTANCE.name or isinstance(law, DistanceField)
+    chosen = as_law(law)
+    return chosen is not None and kernels.reads_distances(chosen.for_kernels)

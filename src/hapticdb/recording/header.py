@@ -20,7 +20,7 @@ from hapticdb.grid import Grid
 from hapticdb.kernels._machine_code import build
 from hapticdb.kernels.records.hand import FRAME
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell
-from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane, law_named
+from hapticdb.query.law import LAWS, ForceLaw, TangentPlane, law_named
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 from hapticdb.store.urls import redact
@@ -97,9 +97,9 @@ class Header:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0):
             raise UsageError(f"rate {self.rate}: give frames a second, above 0")
-        if not isinstance(self.law, (TangentPlane, DistanceField)):
-            kind = type(self.law).__name__
-            raise UsageError(f"law {kind}: only frames of the laws plane and distance are recorded")
+        if type(self.law) not in map(type, LAWS.values()):
+            kind, known = type(self.law).__name__, " and ".join(LAWS)
+            raise UsageError(f"law {kind}: only frames of the laws {known} are recorded")
         try:
             coupling = json.loads(json.dumps(dict(self.coupling), allow_nan=False))
         except (TypeError, ValueError, RecursionError):

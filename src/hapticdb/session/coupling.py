@@ -16,7 +16,7 @@ from hapticdb.devices.stability import limit_stiffness
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw, reads_distances
+from hapticdb.query.law import DistanceField, ForceLaw
 
 Rendering = Literal["coupled", "direct"]
 RENDERINGS: tuple[Rendering, ...] = get_args(Rendering)
@@ -36,15 +36,15 @@ def limit_text(newtons: float, cap: float) -> str:
 
 
 def rendering_of(rendering: Rendering | None, law: ForceLaw) -> Rendering:
-    """Rendering of a session under a law; by default coupled if the law reads distances."""
+    """Rendering of a session under a law; by default coupled under `DistanceField`."""
     if rendering is None:
-        return "coupled" if reads_distances(law) else "direct"
+        return "coupled" if isinstance(law, DistanceField) else "direct"
     if rendering not in RENDERINGS:
         raise UsageError(f"rendering {rendering!r}: choose one of {', '.join(RENDERINGS)}")
-    if rendering == "coupled" and not reads_distances(law):
+    if rendering == "coupled" and not isinstance(law, DistanceField):
         raise UsageError(
-            "the rendering coupled needs distances to surfaces, which the law plane does not read: "
-            "choose the law distance, or the rendering direct"
+            "the rendering coupled computes contacts by the law distance: choose that, or the "
+            "rendering direct"
         )
     return rendering
 

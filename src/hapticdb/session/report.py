@@ -94,7 +94,7 @@ class Report:
         Timing of the session's loop, and of an empty loop at the same rate on this machine just
         before. The empty loop shows the machine's own lateness; None if it was not run.
     law : str
-        Force law of a frame: "plane" or "distance".
+        Name of a frame's force law; a user's: its class.
     rendering : str
         "coupled" or "direct".
     coupling : SettledCoupling or DirectRendering

@@ -307,7 +307,7 @@ class Session(Closes):
             recording_ended=self.recording_ended,
             database_lost=self.database_lost,
             lost_records=recorded.lost,
-            law="distance" if reads_distances(self.law) else "plane",
+            law=getattr(self.law, "name", type(self.law).__name__),
             rendering=self.rendering,
             coupling=self.coupling,
             **counts_of(self._open.shared.slots[0]),

@@ -108,6 +108,8 @@ def feel(
 
     Example: hapticdb feel car.db --tool spanner.stl --device path.csv --rate 1000 --seconds 10
     """
+    from hapticdb.query.law import reads_distances
+
     began = perf_counter()
     rendering = _begin_loop(force, loop)
     chosen, coupling = force.settled(rendering)
@@ -118,13 +120,15 @@ def feel(
     with hapticdb.open(url, read_only=True) as env:  # before a process starts
         found = selection.resolve(env)
         shell = tool.made(env, law, found.excluded).shell
-    session_report.note_cost(len(shell), loop.rate, law, loop.frames_on)
+    session_report.note_cost(
+        len(shell), loop.rate, loop.frames_on, reads_distances=reads_distances(law)
+    )
     doing = "starting" if no_baseline else "measuring an empty loop, then starting"
     with ExitStack() as stack:
         with render.bar(doing, ""):
             cells = stack.enter_context(hapticdb.ResidentCells(
                 url, budget_bytes=budget, where=found.where, exclude=found.exclude,
-                distances=None if force.law is None else force.law == "distance",
+                distances=None if force.law is None else reads_distances(force.law),
             ))  # fmt: skip
             session = stack.enter_context(hapticdb.Session(
                 cells, shell, device, law=chosen, rendering=rendering, coupling=coupling,

@@ -19,8 +19,8 @@ from numba import config, types
 from numba.np.numpy_support import as_dtype, from_dtype
 
 from hapticdb.kernels._jit import INT, chosen_by_type, entry, leaf, record_of
-from hapticdb.kernels.field.distance_law import DISTANCE_FIELD, DistanceFieldLaw
-from hapticdb.kernels.force_law import TANGENT_PLANE
+from hapticdb.kernels.field.distance_law import DISTANCE_FIELD
+from hapticdb.kernels.force_law import TANGENT_PLANE, reads_distances
 from hapticdb.kernels.hand.calling import address_of_kernel, call, call_kernel
 from hapticdb.kernels.hand.direct import render
 from hapticdb.kernels.hand.handle_motion import follow_reading
@@ -107,11 +107,11 @@ def move_by_coupling(slot, which, clock):
 _cells = chosen_by_type(
     lambda law_type: (
         (lambda law, slot: cells_of(slot))  # noqa: ARG005
-        if law_type is DistanceFieldLaw
+        if reads_distances(law_type)
         else (lambda law, slot: voxels_of(slot))  # noqa: ARG005
     )
 )
-"""Cells of a slot, with distances for `DistanceFieldLaw`."""
+"""Cells of a slot, with distances for a law that reads distances."""
 
 
 @entry(from_dtype(SLOT), INT, PLANE, also={PLANE: DISTANCE}, by_address=True)

@@ -68,6 +68,7 @@ SAVE_HISTOGRAM = """
 INSERT INTO quantile VALUES (%s, %s, %s, %s) ON CONFLICT (resolution) DO UPDATE
    SET revision = excluded.revision, n_rows = excluded.n_rows, bounds = excluded.bounds
  WHERE quantile.revision <= excluded.revision"""
+SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(octet_length(geometry)), 0) FROM surface"
 RULES = "SELECT one, other, says, kinds, length, because FROM rule ORDER BY number"
 SAVE_COSTS = """
 INSERT INTO cost VALUES (%s, %s) ON CONFLICT (machine) DO UPDATE SET figures = excluded.figures"""

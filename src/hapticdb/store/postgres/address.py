@@ -56,12 +56,8 @@ def parse(url: str) -> Address:
     try:
         login = conninfo_to_dict(f"{head}?{'&'.join(others)}")
         for key, what in (("user", "user"), ("dbname", "database")):
-            name = str(login.get(key, ""))
-            if len(name.encode()) > LONGEST_NAME:
-                raise UsageError(
-                    f"{shown}: a {what}'s name {name!r} is longer than the {LONGEST_NAME} bytes "
-                    "that PostgreSQL allows: give it as the server lists it"
-                )
+            if name := str(login.get(key, "")):
+                check_name(name, f"{shown}: a {what}'s name")
     except (ProgrammingError, UnicodeError) as error:  # not shown: it may hold the password
         raise failures.unusable(str(error), shown) from None
     hosts = tuple(unquote(one) for part in spread for one in part)

@@ -1,7 +1,5 @@
 """Schema of an environment: creation, opening, checks, deletion."""
 
-from typing import NamedTuple
-
 from psycopg import errors, sql
 
 from hapticdb.errors import (
@@ -86,7 +84,10 @@ def check(connection: ServerConnection) -> None:
             "?environment=NAME"
         )
     if not is_readable:  # without the right, the server hides the schema
-        raise failures.denied(shown, name)
+        raise AccessError(
+            f"{shown}: this user may not read the environment {name!r}; its owner can allow it "
+            "with 'hapticdb grant URL ROLE --as viewer'"
+        )
     for (version,) in connection.rows("SELECT version FROM environment"):
         check_format(shown, version)
 
@@ -107,18 +108,11 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'p' THEN 'table' W
  WHERE nspname = %s AND relkind <> 'i'"""
 
 
-class Made(NamedTuple):
-    """The row `environment`; identity : its table's oid; is_partitioned : rows on partitions."""
+def read_environment(connection: ServerConnection) -> tuple[Grid, Layout, bool, int, bool]:
+    """Checked row of `environment`: grid, layout, and whether imports compute distances.
 
-    grid: Grid
-    layout: Layout
-    wants_distances: bool
-    identity: int
-    is_partitioned: bool
-
-
-def read_environment(connection: ServerConnection) -> Made:
-    """Read and check the one row of the table `environment`."""
+    Then its table's oid, and whether the rows are on partitions.
+    """
     kinds = dict(connection.rows(TABLE_KINDS, (connection.address.environment,)))
     rows = connection.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout,"
@@ -128,7 +122,7 @@ def read_environment(connection: ServerConnection) -> Made:
     grid, layout = parsing.grid_of(connection.shown, rows)
     parsing.check_tables(connection.shown, kinds)
     wants = parsing.distances_wanted(connection.shown, rows[0][8])
-    return Made(grid, layout, wants, rows[0][7], bool(rows[0][9]))
+    return grid, layout, wants, rows[0][7], bool(rows[0][9])
 
 
 def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
@@ -174,8 +168,4 @@ def _there_already(connection: ServerConnection) -> EnvironmentExistsError:
 def drop(connection: ServerConnection) -> None:
     """Delete an environment with its contents."""
     partitions.drop(connection, connect)
-    schema = sql.Identifier(connection.address.environment)
-    connection.write(
-        lambda: connection.execute(sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema)),
-        lambda: not _has_schema(connection),
-    )
+    partitions.drop_schema(connection)

@@ -17,12 +17,10 @@ from psycopg import errors, sql
 
 from hapticdb.errors import AccessError, EnvironmentExistsError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.store.base import Layout, row_shift
+from hapticdb.store.base import CELL_SHIFT, Layout, row_shift
 from hapticdb.store.postgres.address import Address, partition_addresses
 from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 
-CELL_BITS = 15
-"""Bits of a voxel's key within its cell."""
 SCHEMA = Path(__file__).with_name("schema.sql").read_text(encoding="utf-8")
 """Creates all tables and functions of an environment, in its schema."""
 SIZE = """
@@ -52,7 +50,7 @@ def ends(grid: Grid, layout: Layout, n: int) -> list[int]:
     """First keys (n - 1,) of all but the first of n partitions, on cells if possible."""
     shift = row_shift(layout)
     # this many bits leave at least one cell for each partition; else ends lie between rows
-    within = CELL_BITS if 3 * grid.bits >= CELL_BITS + n.bit_length() else shift
+    within = CELL_SHIFT if 3 * grid.bits >= CELL_SHIFT + n.bit_length() else shift
     cells = 1 << max(3 * grid.bits - within, 0)
     if cells < n:
         raise UsageError(
@@ -118,11 +116,16 @@ def _server_name(environment: str, number: object) -> str:
     return f"hapticdb {environment} {number}"
 
 
+def drop_schema(connection: ServerConnection) -> None:
+    """Delete the environment's schema on one server."""
+    schema = sql.Identifier(connection.address.environment)
+    text = sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema)
+    connection.write(lambda: connection.execute(text))
+
+
 def _undo(made: Sequence[ServerConnection]) -> None:
     for one in made:
-        schema = sql.Identifier(one.address.environment)
-        text = sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema)
-        one.write(lambda one=one, text=text: one.execute(text))  # type: ignore[misc]
+        drop_schema(one)
         one.close()
 
 

@@ -33,7 +33,6 @@ ATTEMPT = re.compile(
     r"(?:FATAL: +)?(?P<why>.*)"
 )
 """Message of psycopg and libpq for one attempt to connect."""
-FULL = "too many clients|too many connections|slots are reserved|no more connections allowed"
 
 
 @contextlib.contextmanager
@@ -122,7 +121,8 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
         cause,
     ):
         return AccessError(f"{shown}: {cause}; check the user, ~/.pgpass and pg_hba.conf")
-    if re.search(FULL, cause):
+    full = "too many clients|too many connections|slots are reserved|no more connections allowed"
+    if re.search(full, cause):
         return ConnectionLostError(
             f"{shown} has no free connection ({cause}): end programs that use this server, or "
             "raise max_connections there"
@@ -165,14 +165,6 @@ def unusable(cause: str, shown: str) -> UsageError:
     )
 
 
-def denied(shown: str, name: str) -> AccessError:
-    """Build the error for an environment without the right to read it."""
-    return AccessError(
-        f"{shown}: this user may not read the environment {name!r}; its owner can allow it with "
-        "'hapticdb grant URL ROLE --as viewer'"
-    )
-
-
 def standby(shown: str) -> ReadOnlyError:
     """Build the error for a server without writes."""
     return ReadOnlyError(
@@ -184,22 +176,6 @@ def standby(shown: str) -> ReadOnlyError:
 def remade(shown: str) -> ConnectionLostError:
     """Build the error for an environment dropped and created anew."""
     return ConnectionLostError(f"{shown} is another environment than before: open it again")
-
-
-def pooled(shown: str) -> DatabaseError:
-    """Build the error for a transaction on another server connection than the prepared one."""
-    return DatabaseError(
-        f"{shown} seems to be behind a pooler in transaction mode, which may write to another "
-        "schema: connect to the server itself, or use session pooling; nothing was written"
-    )
-
-
-def no_editor(shown: str) -> ReadOnlyError:
-    """Build the error for a user with rights on the environment, but not on its objects."""
-    return ReadOnlyError(
-        f"{shown}: this user may not change objects; its owner can allow it with "
-        "'hapticdb grant URL ROLE --as editor'"
-    )
 
 
 def _line(error: psycopg.Error) -> str:

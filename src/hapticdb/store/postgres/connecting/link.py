@@ -63,6 +63,7 @@ ANSWER_S, PROMPT_ANSWER_S = 5.0, 0.15
 """Seconds for a server to accept such a test, and again to answer it; likewise. Smaller: a busy
 server counts as hanging."""
 SSL_REQUEST = struct.pack("!ii", 8, 80877103)
+FINE = (pq.ExecStatus.TUPLES_OK, pq.ExecStatus.COMMAND_OK, pq.ExecStatus.EMPTY_QUERY)
 
 
 class SilentServerError(StuckError):
@@ -132,7 +133,8 @@ class Link:
     def __init__(self, address: Address, *, read_only: bool) -> None:
         self.address = address
         self.shown = address.shown
-        self._search_path = f"{_quoted(address.environment)}, pg_temp"
+        quoted = address.environment.replace('"', '""')
+        self._search_path = f'"{quoted}", pg_temp'
         self.is_read_only = read_only
         self._leisure = 0
         self.given_up: SilentServerError | None = None
@@ -253,11 +255,6 @@ class Link:
 
     # -- waiting -----------------------------------------------------------------------------
 
-    @property
-    def _timeout_ms(self) -> int | None:
-        """Milliseconds to wait for an answer; None inside `without_time_limit`."""
-        return None if self._leisure else self._limit_ms
-
     @contextlib.contextmanager
     def without_time_limit(self) -> Iterator[None]:
         """Wait inside as long as the server answers a new client: for long statements."""
@@ -273,7 +270,7 @@ class Link:
             # the driver's own wait would take 10 s to end after Ctrl-C while a server hangs
             answer = self.until_timeout(generators.execute(self._pgconn))
             found: pq.abc.PGresult = waiting.wait(answer, self._pgconn.socket, STEP_S)[-1]
-            if found.status not in _FINE:
+            if found.status not in FINE:
                 raise error_from_result(found, encoding="utf-8")  # noqa: TRY301 - may be a loss, too
         except psycopg.Error as error:
             if failures.is_lost(error):
@@ -291,11 +288,15 @@ class Link:
             wanted = next(answer)
             while True:
                 ready = yield wanted
-                now, most = time.monotonic(), self._timeout_ms
+                # no limit inside `without_time_limit`
+                now, most = time.monotonic(), None if self._leisure else self._limit_ms
                 if ready:
                     heard = now
                 elif most is not None and 1000 * (now - started) > most:
-                    raise self._stuck()
+                    raise SilentServerError(
+                        f"{self.shown} did not answer within {most} ms: the server, or the way to "
+                        "it, hangs"
+                    )
                 elif now - heard > (PROMPT_SILENCE_S if self.is_prompt else SILENCE_S):
                     self._check_answers(PROMPT_ANSWER_S if self.is_prompt else ANSWER_S)
                     heard = time.monotonic()
@@ -311,16 +312,3 @@ class Link:
                 f"{seconds:.3g} s: the server, or the way to it, hangs; try again when "
                 "it answers"
             )
-
-    def _stuck(self) -> SilentServerError:
-        return SilentServerError(
-            f"{self.shown} did not answer within {self._timeout_ms} ms: "
-            "the server, or the way to it, hangs"
-        )
-
-
-_FINE = (pq.ExecStatus.TUPLES_OK, pq.ExecStatus.COMMAND_OK, pq.ExecStatus.EMPTY_QUERY)
-
-
-def _quoted(name: str) -> str:
-    return '"' + name.replace('"', '""') + '"'

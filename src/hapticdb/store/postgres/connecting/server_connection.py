@@ -140,7 +140,11 @@ class ServerConnection(Link, Closes):
             self._depth -= 1
             # the transaction of a lost connection has ended with it
             if self._depth == 0 and not self.is_lost:
-                self._end_snapshot()
+                try:
+                    with failures.named_errors(self.shown):
+                        self.command("COMMIT")
+                except ConnectionLostError:  # no error: the reads are complete
+                    self.drop()
 
     def write(
         self, work: Callable[[], Result], is_committed: Callable[[], bool] | None = None
@@ -195,7 +199,9 @@ class ServerConnection(Link, Closes):
                 self.begin(*(f"{limit} = 0" for limit in limits))
                 result = work()
             except BaseException:
-                self._roll_back()
+                with contextlib.suppress(psycopg.Error):
+                    if not self.is_lost:
+                        self.command("ROLLBACK")
                 raise
             finally:
                 self._depth -= 1
@@ -221,27 +227,17 @@ class ServerConnection(Link, Closes):
         query = "SELECT current_setting('search_path')"
         found = self.command("; ".join(["BEGIN ISOLATION LEVEL READ COMMITTED", *local, query]))
         if found.get_value(0, 0) != self._search_path.encode():
-            raise failures.pooled(self.shown)
-
-    def _end_snapshot(self) -> None:
-        """End the transaction. A lost connection is no error: the reads are complete."""
-        try:
-            with failures.named_errors(self.shown):
-                self.command("COMMIT")
-        except ConnectionLostError:
-            self.drop()
-
-    def _roll_back(self) -> None:
-        with contextlib.suppress(psycopg.Error):
-            if not self.is_lost:
-                self.command("ROLLBACK")
+            raise DatabaseError(
+                f"{self.shown} seems to be behind a pooler in transaction mode, which may write to "
+                "another schema: connect to the server itself, or use session pooling; nothing was "
+                "written"
+            )
 
     @contextlib.contextmanager
     def without_limit(self, *limits: str) -> Iterator[None]:
         """Suspend the named time limits inside; `statement_timeout` if none is named."""
         names = limits or ("statement_timeout",)
-        # the connection may have been lost since its last use
-        before = self.again(lambda: [self._shown_setting(name) for name in names])
+        before = [self.rows(f"SHOW {name}")[0][0] for name in names]
         with failures.named_errors(self.shown), self.without_time_limit():
             for name in names:
                 self.command(f"SET {name} = 0")
@@ -251,10 +247,6 @@ class ServerConnection(Link, Closes):
                 if self.is_usable():
                     for name, value in zip(names, before, strict=True):
                         self.command(f"SET {name} = '{value}'")
-
-    def _shown_setting(self, name: str) -> str:
-        row = self.driver.execute(f"SHOW {name}").fetchone()
-        return row[0] if row else "0"
 
     def is_owner(self) -> bool:
         """Whether this user owns the environment's tables, and so may create indexes and grant."""

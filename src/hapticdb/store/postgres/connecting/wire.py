@@ -18,7 +18,6 @@ INT8_ARRAY, FLOAT8_ARRAY = 1016, 1022
 HEADER_BYTES = 20
 _INT8S = np.dtype([("length", ">i4"), ("value", ">i8")])
 _FLOAT8S = np.dtype([("length", ">i4"), ("value", ">f8")])
-_STRIDE = _INT8S.itemsize
 
 COPY_HEADER = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 COPY_TRAILER = b"\xff\xff"
@@ -83,15 +82,12 @@ def read_int8s(value: bytes | None) -> NDArray[np.int64]:
     """Parse a bigint[] without NULLs; NULL itself gives an empty array."""
     if value is None or len(value) < HEADER_BYTES:
         return np.empty(0, np.int64)
-    count = (len(value) - HEADER_BYTES) // _STRIDE
-    # a strided view of the values alone, over the length before each
-    return np.ndarray((count,), ">i8", value, HEADER_BYTES + 4, (_STRIDE,)).astype(np.int64)
+    return np.frombuffer(value, _INT8S, offset=HEADER_BYTES)["value"].astype(np.int64)
 
 
 def read_float8s(value: bytes) -> NDArray[np.float64]:
     """Parse a double precision[] without NULLs."""
-    count = (len(value) - HEADER_BYTES) // _STRIDE
-    return np.ndarray((count,), ">f8", value, HEADER_BYTES + 4, (_STRIDE,)).astype(np.float64)
+    return np.frombuffer(value, _FLOAT8S, offset=HEADER_BYTES)["value"].astype(np.float64)
 
 
 def copy_rows(rows: Rows, object_id: int) -> bytes:

@@ -12,10 +12,9 @@ from types import TracebackType
 
 import psycopg
 
-from hapticdb.errors import ConnectionLostError
+from hapticdb.errors import ConnectionLostError, ReadOnlyError
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import environment_schema
-from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 
 # Advisory locks of an environment: one for its loaders, one for the builder of the index. The key
@@ -24,58 +23,14 @@ LOADERS, MAKERS = 0x48415054, 0x48415055
 KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
-class _Index:
-    """Index of an environment's rows, and their table; table None for rows on partitions."""
+class Loading:
+    """Context for the writes of many objects by one connection.
+
+    table : of the rows; None for rows on partitions, which keep their indexes.
+    """
 
     def __init__(self, connection: ServerConnection, table: Layout | None) -> None:
-        self._connection = connection
-        self.table = table
-
-    def is_there(self) -> bool:
-        """Whether the index exists, or is not needed here."""
-        text = "SELECT to_regclass(%s) IS NOT NULL"
-        return self.table is None or self._connection.rows(text, (f"{self.table}_key",))[0][0]
-
-    def has_no_rows(self) -> bool:
-        """Whether the table exists, and is empty."""
-        text = f"SELECT EXISTS (SELECT 1 FROM {self.table})"
-        return self.table is not None and self._connection.rows(text) == [(False,)]
-
-    def drop(self) -> None:
-        """Drop the index; while others read, it stays, after 50 ms."""
-        connection = self._connection
-        with contextlib.suppress(psycopg.errors.LockNotAvailable):
-            try:
-                connection.begin("lock_timeout = '50ms'")
-                connection.command(f"DROP INDEX IF EXISTS {self.table}_key")
-                connection.command("COMMIT")
-            except BaseException:
-                if not connection.driver.closed:
-                    connection.command("ROLLBACK")
-                raise
-
-    def make(self) -> None:
-        """Build the missing index, while readers go on and writers wait."""
-        connection = self._connection
-        connection.command("SET maintenance_work_mem = '256MB'")
-        connection.command(
-            f"CREATE UNIQUE INDEX IF NOT EXISTS {self.table}_key ON {self.table} (z_val, id)"
-        )
-        connection.command("RESET maintenance_work_mem")
-
-    def vacuum(self) -> None:
-        """Update the visibility map, for frames by index-only scans."""
-        self._connection.command(f"VACUUM {self.table}")
-
-
-class Loading:
-    """Context for the writes of many objects by one connection; partitions keep their indexes."""
-
-    def __init__(
-        self, connection: ServerConnection, layout: Layout, *, is_partitioned: bool
-    ) -> None:
-        self._connection = connection
-        self._index = _Index(connection, None if is_partitioned else layout)
+        self._connection, self._table = connection, table
         self._depth = 0
         self._is_owner = False
         self._has_written = False
@@ -88,15 +43,23 @@ class Loading:
 
     def _begin(self) -> None:
         connection = self._connection
-        self._check_editor()
+        # now, before minutes of reading files
+        text = "SELECT has_column_privilege('environment', 'revision', 'UPDATE')"
+        if connection.rows(text) != [(True,)]:
+            raise ReadOnlyError(
+                f"{connection.shown}: this user may not change objects; its owner can allow it "
+                "with 'hapticdb grant URL ROLE --as editor'"
+            )
         self._has_written = False
         with connection.without_limit("statement_timeout", "lock_timeout"):
             # shared: several loaders at a time
             connection.execute(f"SELECT pg_advisory_lock_shared({KEY})", (LOADERS,))
             try:
                 self._is_owner = connection.is_owner()
-                if self._is_owner and self._index.has_no_rows():
-                    self._index.drop()
+                if self._is_owner and self._table is not None:
+                    text = f"SELECT EXISTS (SELECT 1 FROM {self._table})"
+                    if connection.rows(text) == [(False,)]:
+                        self._drop_index()
             except BaseException:
                 self._unlock("_shared", LOADERS)
                 raise
@@ -119,20 +82,12 @@ class Loading:
                 return
         with connection.without_limit("statement_timeout", "lock_timeout"):
             try:
-                if self._is_owner and self._index.table is not None:
+                if self._is_owner and self._table is not None:
                     self._make_index()
-                    if self._has_written:  # for frames by index-only scans
-                        self._index.vacuum()
+                    if self._has_written:  # visibility map, for frames by index-only scans
+                        connection.command(f"VACUUM {self._table}")
             finally:
                 self._unlock("_shared", LOADERS)
-
-    def _check_editor(self) -> None:
-        """Refuse a user without the right to edit objects, before minutes of reading files."""
-        ((may_edit,),) = self._connection.rows(
-            "SELECT has_column_privilege('environment', 'revision', 'UPDATE')"
-        )
-        if not may_edit:
-            raise failures.no_editor(self._connection.shown)
 
     def note(self) -> None:
         """Note a write inside the context."""
@@ -141,7 +96,9 @@ class Loading:
     def build_missing_index(self) -> None:
         """Build the index missing after a killed loader, unless somebody is loading now."""
         connection = self._connection
-        if not connection.is_owner() or self._index.is_there():
+        if self._table is None or not connection.is_owner():
+            return
+        if connection.rows("SELECT to_regclass(%s) IS NOT NULL", (f"{self._table}_key",))[0][0]:
             return
         with (
             connection.without_limit("statement_timeout", "lock_timeout"),
@@ -173,11 +130,31 @@ class Loading:
             with contextlib.suppress(psycopg.Error):  # the environment itself may be deleted
                 self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
 
+    def _drop_index(self) -> None:
+        """Drop the index; while others read, it stays, after 50 ms."""
+        connection = self._connection
+        with contextlib.suppress(psycopg.errors.LockNotAvailable):
+            try:
+                connection.begin("lock_timeout = '50ms'")
+                connection.command(f"DROP INDEX IF EXISTS {self._table}_key")
+                connection.command("COMMIT")
+            except BaseException:
+                if not connection.driver.closed:
+                    connection.command("ROLLBACK")
+                raise
+
     def _make_index(self) -> None:
-        """Build the index, one connection at a time: IF NOT EXISTS alone would let two begin."""
+        """Build the missing index, while readers go on and writers wait.
+
+        One connection at a time: IF NOT EXISTS alone would let two begin.
+        """
         connection = self._connection
         connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:
-            self._index.make()
+            connection.command("SET maintenance_work_mem = '256MB'")
+            connection.command(
+                f"CREATE UNIQUE INDEX IF NOT EXISTS {self._table}_key ON {self._table} (z_val, id)"
+            )
+            connection.command("RESET maintenance_work_mem")
         finally:
             self._unlock("", MAKERS)

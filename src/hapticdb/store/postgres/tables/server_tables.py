@@ -15,8 +15,8 @@ from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.loading import Loading
-from hapticdb.store.postgres.watching import channel_of
-from hapticdb.store.tables import Tables
+from hapticdb.store.postgres.watching import REVISION, channel_of
+from hapticdb.store.tables import SIZE_OF_SURFACES, Tables
 
 Result = TypeVar("Result")
 
@@ -43,7 +43,6 @@ DELETE_PAIRS = """
 DELETE FROM pair USING unnest(%s::bigint[], %s::bigint[]) AS gone (a, b)
  WHERE (pair.a, pair.b) = (gone.a, gone.b)"""
 SIZE_OF_PARTITIONS = "SELECT sum(bytes), sum(pages) FROM size"
-SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(octet_length(geometry)), 0) FROM surface"
 SERVER_RESOLUTION = 10_000
 """Buckets of the server's histogram: the server's maximum, and the paper's best resolution."""
 ENOUGH_ROWS = 10 * SERVER_RESOLUTION
@@ -83,7 +82,7 @@ class ServerTables(Tables):
         made = environment_schema.read_environment(connection)
         self.grid, self.layout, self.wants_distances, self.identity, self._is_partitioned = made
         self._seen = -1
-        self._loading = Loading(connection, self.layout, is_partitioned=self._is_partitioned)
+        self._loading = Loading(connection, None if self._is_partitioned else self.layout)
         self._written: tuple[Any, ...] = ()
         self._highest_id = (0, 0)  # and its revision
 
@@ -117,8 +116,7 @@ class ServerTables(Tables):
         return self._seen
 
     def revision(self) -> int:
-        text = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
-        ((self._seen, identity),) = self._rows(text)
+        ((self._seen, identity),) = self._rows(REVISION)
         if identity != self.identity:
             raise failures.remade(self.url)
         return self._seen

@@ -14,7 +14,7 @@ from hapticdb.store.base import LAYOUTS, NO_KEYS, Keys, Layout, Object, Rows, Si
 from hapticdb.store.covering import Ranges
 from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.sqlite.file_connection import FileConnection
-from hapticdb.store.tables import LAST_REVISION, Tables
+from hapticdb.store.tables import LAST_REVISION, SIZE_OF_SURFACES, Tables
 
 Result = TypeVar("Result")
 KINDS = """
@@ -35,7 +35,6 @@ DELETE: dict[Layout, str] = {
     layout: f"DELETE FROM {layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
     for layout in LAYOUTS
 }
-SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(length(geometry)), 0) FROM surface"
 
 
 def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:

@@ -20,7 +20,6 @@ MUCH, HALF_TURN = 170.0, 179.99
 """Degrees between two poses: from the first on a doubtful turn, beyond the second half a turn."""
 AT_ONCE = 64
 """Segments of a batch of turns. Larger: more memory."""
-NO_POSES = np.empty((0, 4, 4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +85,19 @@ class ToolPath(SampledPath):
 
     @classmethod
     def joined(
-        cls, pieces: Iterable[Floats], corners: Floats, center: Floats, given: Floats = NO_POSES
+        cls, pieces: Iterable[Floats], corners: Floats, center: Floats, given: Floats
     ) -> "ToolPath":
-        """The same through pieces of a path, each from the last pose of the one before."""
-        parts = [_steps(piece, corners, center, is_later=n > 0) for n, piece in enumerate(pieces)]
-        # pieces are freed array by array: the peak is a third above the result
-        columns = [[*column] for column in zip(*parts, strict=True)]
-        del parts
-        turns, rotations, centers, motion = (np.concatenate(columns.pop()) for _ in range(4))
+        """The same through pieces, each from the last pose of the one before; given : `poses`."""
+        parts: list[tuple[Floats, ...]] = []
+        for poses in pieces:
+            quaternions, first = quaternion_of(poses[:, :3, :3]), int(bool(parts))
+            centers = poses[:, :3, :3] @ center + poses[:, :3, 3]
+            turns, rotations = _turns_between(quaternions), rotation_of(quaternions)
+            with np.errstate(over="ignore"):
+                motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+            motion += _turned(corners - center, turns, rotations[:-1])
+            parts.append((motion, centers[first:], rotations[first:], turns))
+        motion, centers, rotations, turns = map(np.concatenate, zip(*parts, strict=True))
         parameters = np.concatenate([[0.0], np.cumsum(motion)])
         if not np.isfinite(parameters[-1]):
             raise UsageError("the path is longer than numbers go: check its unit")
@@ -122,19 +126,6 @@ class ToolPath(SampledPath):
         out = np.tile(np.eye(4), (len(parameters), 1, 1))
         poses_kernel(self.motion, self.segments(parameters), parameters, out)
         return out
-
-
-def _steps(
-    poses: Floats, corners: Floats, center: Floats, *, is_later: bool
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Lengths, centres, rotations and turns; is_later : without those of the first pose."""
-    quaternions = quaternion_of(poses[:, :3, :3])
-    centers, turns = poses[:, :3, :3] @ center + poses[:, :3, 3], _turns_between(quaternions)
-    with np.errstate(over="ignore"):
-        motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    rotations = rotation_of(quaternions)
-    motion += _turned(corners - center, turns, rotations[:-1])
-    return motion, centers[is_later:], rotations[is_later:], turns
 
 
 def checked_poses(poses: ArrayLike) -> Floats:

@@ -11,7 +11,6 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import reduce
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,11 +19,13 @@ from hapticdb.errors import FileError, UsageError
 from hapticdb.exact.distance import in_time
 from hapticdb.exact.movers import Mover
 from hapticdb.exact.path import SampledPath, ToolPath, checked_poses
-from hapticdb.machines.machine import HINGE, Bounds, Machine, motion_bounds
+from hapticdb.machines.machine import HINGE, Machine, motion_bounds
 from hapticdb.poses import as_floats
 from hapticdb.units import UNITS
 
 Floats = NDArray[np.float64]
+RowSteps = tuple[Floats, NDArray[np.int32]]
+"""Of a link between two rows, (rows - 1,) each: metres of its fastest place; parts of its path."""
 
 DEVIATION = 2e-6
 """Greatest deviation of a link from its motion, metres. Larger: fewer poses, and wider bounds."""
@@ -38,13 +39,6 @@ MOST_VALUE = 1e6
 """Greatest value of a joint, rad or m. Larger: rounding has a part in the deviation."""
 _NAME = re.compile(r"(.*?)\s*(?:\[\s*(\S+)\s*\])?")
 _DEGREE = np.pi / 180.0
-
-
-class RowSteps(NamedTuple):
-    """Of a link's motion between two rows, (rows - 1,) each: metres of its fastest place, parts."""
-
-    speed: Floats
-    counts: NDArray[np.int32]
 
 
 def read_joints(path: str, machine: Machine) -> Floats:
@@ -144,31 +138,28 @@ def joint_path(
     Beside it the steps of each pair: a link in the frame of the first. until : end,
     `time.monotonic`, by OverTimeError.
     """
-    pieces: list[list[RowSteps]] = [[] for _ in pairs]
+    pieces: dict[tuple[int, int], list[RowSteps]] = {pair: [] for pair in pairs}
     for first in range(0, len(values) - 1, AT_ONCE):
         some = values[first : first + AT_ONCE + 1]
         placed = machine.all_placed(some)
-        for pair, found in in_time(zip(pairs, pieces, strict=True), until):
+        for pair in in_time(pairs, until):
             with np.errstate(over="ignore", invalid="ignore"):
-                found.append(_steps(motion_bounds(machine, some, *pair, placed)))
+                speed, bend, turn = motion_bounds(machine, some, *pair, placed)
+                # chord error h^2 / 8 times the second derivative, solved for the number of parts
+                counts = np.maximum(np.sqrt(bend / (8.0 * DEVIATION)), turn / MOST_TURN)
+            # fmin: NaN and infinity are too many, too
+            counts = np.fmin(np.maximum(np.ceil(counts), 1.0), MOST_POSES + 1)
+            pieces[pair].append((speed, counts.astype(np.int32)))
     steps = {
-        pair: RowSteps(*map(np.concatenate, zip(*found, strict=True)))
-        for pair, found in zip(pairs, pieces, strict=True)
+        pair: (np.concatenate([one for one, _ in some]), np.concatenate([one for _, one in some]))
+        for pair, some in pieces.items()
     }
     # the fastest pair of links: a bound for all, so one parameter orders every hit
-    fastest = reduce(np.maximum, (one.speed for one in steps.values()))
+    fastest = reduce(np.maximum, (speed for speed, _ in steps.values()))
     parameters = np.concatenate([[0.0], np.cumsum(fastest)])
     if not np.isfinite(parameters[-1]):
         raise UsageError("the joint path is longer than numbers go: check its units")
     return SampledPath(parameters, values), steps
-
-
-def _steps(bounds: Bounds) -> RowSteps:
-    # chord error h^2 / 8 times the second derivative, solved for the number of parts
-    counts = np.maximum(np.sqrt(bounds.bend / (8.0 * DEVIATION)), bounds.turn / MOST_TURN)
-    # fmin, so NaN and infinity are too many, too
-    counts = np.fmin(np.maximum(np.ceil(counts), 1.0), MOST_POSES + 1)
-    return RowSteps(bounds.speed, counts.astype(np.int32))
 
 
 def mover_of(
@@ -179,7 +170,7 @@ def mover_of(
 
     base (4, 4) : `world_from_base`; until : as of `joint_path`.
     """
-    counts, surface = steps.counts, machine.surfaces[last]
+    counts, surface = steps[1], machine.surfaces[last]
     if counts.sum() > MOST_POSES:
         raise UsageError(
             f"link {machine.names[last]} moves too far for one sweep: divide the joint path"
@@ -200,6 +191,7 @@ def mover_of(
         return checked_poses(poses)
 
     pieces = map(placed, in_time(range(0, len(knots) - 1, AT_ONCE), until))
-    motion = ToolPath.joined(pieces, surface.corners, surface.corners.mean(axis=0))
+    center, none = surface.corners.mean(axis=0), np.empty((0, 4, 4))
+    motion = ToolPath.joined(pieces, surface.corners, center, none)
     parameters = np.interp(knots, rows, path.parameters)
     return Mover(surface, motion, machine.names[last], parameters, frame, DEVIATION)

@@ -158,7 +158,7 @@ def _link_pairs(
         placed = machine.all_placed(values)
         for a, b in in_time(pairs, until):
             # no place moves farther from the middle of a stretch: boxes there bound the gap
-            reach = np.repeat(steps[a, b].speed[some] / (2 * parts), parts)
+            reach = np.repeat(steps[a, b][0][some] / (2 * parts), parts)
             poses, box = np.linalg.inv(placed[a]) @ placed[b], machine.surfaces[a].box
             gaps = machine.surfaces[b].box_gaps(box[None], poses, reach)
             least[a, b] = min(least[a, b], float(gaps.min()))

@@ -267,6 +267,24 @@ def test_sweep_envelope_is_stored_and_replaced(run: Run, scene: Path) -> None:
     refused(run(*words[:-1], "fine", "--envelope-voxel", "1um"), "1 µm", "would do")
 
 
+@pytest.mark.usefixtures("through")
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("swept", "--envelope-voxel", "1um"), "would do"),
+        (("swept",), "outside the grid's"),
+        (("sw\udcffept",), "is no text"),
+    ],
+)
+def test_sweep_envelope_refused_before_the_sweep(
+    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], told: str
+) -> None:
+    poses(scene.parent / "away.csv", (-0.05, 0.0, 0.15), (50.0, 0.0, 0.15))
+    path = "away.csv" if "grid" in told else "through.csv"
+    monkeypatch.setattr(sweeping, "sweep", lambda *_, **__: pytest.fail("it has begun"))
+    refused(run("sweep", scene, *TOOL, "--path", path, "--envelope", *words), told)
+
+
 def test_sweep_envelope_of_machine_stored(run: Run, scene: Path) -> None:
     scene.with_name("crane.urdf").write_text(
         '<robot name="crane"><link name="base"/><link name="hook"><collision><geometry>'

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.exact.swept import Swept
     from hapticdb.machines.machine import Machine
+    from hapticdb.mesh import Part
     from hapticdb.pointshell.shell import PointShell
 
 HELP = f"""Check whether a tool or part is free along a path.
@@ -123,13 +124,13 @@ class _Job(NamedTuple):
 
 
 class _Findings(NamedTuple):
-    """Result of a sweep with its tool or machine; seconds : of the sweep and of making the tool."""
+    """Result of a sweep with its tool, None for a machine; seconds : with making the tool."""
 
     job: _Job
     shell: "PointShell | None"
     found: "Swept"
     seconds: float
-    machine: "Machine | None" = None
+    envelope: "Part | None" = None
 
 
 def sweep(
@@ -165,16 +166,16 @@ def sweep(
     with (
         open_csv(output.csv, SWEPT_KEYS) as table,
         ExitStack() as curves,
-        hapticdb.open(url, read_only=True) as env,
+        hapticdb.open(url, read_only=not stored.envelope) as env,
     ):
         files = [Path(file) for file in motion.gaps or ()]
         adds = [curves.enter_context(open_table(file, "--gaps", plot=gap_plot)) for file in files]
         exclude += stored.former(env)
         if machine.machine is None:
             jobs = [_job(env, each, motion.path_unit) for each in requests]
-            findings = _all_told((_swept(env, job, motion) for job in jobs), output)
+            findings = _all_told((_swept(env, job, motion, stored) for job in jobs), output)
         else:
-            findings = _all_told([_machine_swept(env, one, machine, motion)], output)
+            findings = _all_told([_machine_swept(env, one, machine, motion, stored)], output)
         if table:
             table.add(*findings[0].found.records())
         if gaps := findings[0].found.gaps:
@@ -186,8 +187,9 @@ def sweep(
             _show(findings[0])
         elif output.has_words:
             _show_batch(findings)
-    if stored.envelope:
-        _store(url, findings[0], machine, motion, stored)
+        if made := findings[0].envelope:
+            env.add(made, replace=stored.replace)
+            render.note(f"envelope stored as {made.name}, in voxels of {made.attributes['voxel']}")
     codes = {one.found.verdict.exit_status for one in findings}
     raise typer.Exit(next(code for code in WORST if code in codes))
 
@@ -237,22 +239,27 @@ def _job(env: "Environment", request: ListedSweep, path_unit: str | None) -> _Jo
         )
 
 
-def _store(
-    url: str, one: _Findings, given: MachineOptions, motion: SweepOptions, stored: EnvelopeOptions
-) -> None:
-    """Store the envelope of a sweep."""
+def _envelope(
+    env: "Environment", job: _Job, moved: "PointShell | Machine", stored: EnvelopeOptions,
+    about: Point | None = None, at: "NDArray[np.float64] | None" = None,
+) -> "Part | None":  # fmt: skip
+    """Envelope of a path, if wanted; made first: what is wrong with it ends no long sweep."""
     import hapticdb
+    from hapticdb.ingest.files import ImportOptions
+    from hapticdb.ingest.planning import check_names, planned
+    from hapticdb.mesh import MeshFile
 
-    moved = one.shell or one.machine
-    assert moved is not None  # noqa: S101 - one of them moves
-    with render.bar("making the envelope", "samples"), hapticdb.open(url) as env:
+    if not stored.envelope:
+        return None
+    with render.bar("making the envelope", "samples"):
         part = hapticdb.sweep_envelope(
-            moved, one.job.poses, stored.envelope or "", voxel=stored.envelope_voxel,
-            about=motion.about, at=None if given.at is None else pose_of(given.at, "--at"),
-        )  # fmt: skip
-        part.attributes.update(envelope=one.job.request.name, path=one.job.request.path)
-        env.add(part, replace=stored.replace)
-    render.note(f"envelope stored as {part.name}, in voxels of {part.attributes['voxel']}")
+            moved, job.poses, stored.envelope, voxel=stored.envelope_voxel, about=about, at=at
+        )
+    file, most = MeshFile("--envelope", [part], part.defects), ImportOptions().voxel_limit
+    check_names(file)
+    planned(file, None, env.grid, {}, set(), replace=False, keep_removed=False, voxel_limit=most)
+    part.attributes.update(envelope=job.request.name, path=job.request.path)
+    return part
 
 
 def _all_told(sweeps: Iterable[_Findings], output: TableOutput) -> list[_Findings]:
@@ -271,8 +278,9 @@ def _all_told(sweeps: Iterable[_Findings], output: TableOutput) -> list[_Finding
 
 
 def _machine_swept(
-    env: "Environment", request: ListedSweep, given: MachineOptions, motion: SweepOptions
-) -> _Findings:
+    env: "Environment", request: ListedSweep, given: MachineOptions, motion: SweepOptions,
+    stored: EnvelopeOptions,
+) -> _Findings:  # fmt: skip
     """Read a machine, and sweep it along its joint path."""
     from hapticdb.machines.joint_path import read_joints
     from hapticdb.machines.machine_sweep import sweep_machine
@@ -282,21 +290,24 @@ def _machine_swept(
     selection = FilterOptions(request.where, request.exclude).resolve(env)
     with render.bar("reading the machine", "files"):
         machine = read_machine(given.machine or "", given.srdf)
-    q = read_joints(request.path, machine)
+    at = None if given.at is None else pose_of(given.at, "--at")
+    job = _Job(request, read_joints(request.path, machine), [], selection)
+    envelope = _envelope(env, job, machine, stored, at=at)
     with render.bar("sweeping", "objects") as progress:
         found = sweep_machine(
-            env, machine, q, at=None if given.at is None else pose_of(given.at, "--at"),
-            where=selection.where, exclude=selection.exclude, contact=request.contact,
-            overlap=motion.overlap, seconds=motion.seconds, until_hit=motion.until_hit,
-            cloud_radius=motion.cloud_radius, within=motion.within if motion.gaps else None,
-            progress=progress,
+            env, machine, job.poses, at=at, where=selection.where, exclude=selection.exclude,
+            contact=request.contact, overlap=motion.overlap, seconds=motion.seconds,
+            until_hit=motion.until_hit, cloud_radius=motion.cloud_radius,
+            within=motion.within if motion.gaps else None, progress=progress,
         )  # fmt: skip
     for note in found.notes:
         render.note(note)
-    return _Findings(_Job(request, q, [], selection), None, found, perf_counter() - began, machine)
+    return _Findings(job, None, found, perf_counter() - began, envelope)
 
 
-def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Findings:
+def _swept(
+    env: "Environment", job: _Job, motion: SweepOptions, stored: EnvelopeOptions
+) -> _Findings:
     """Make the tool, and sweep it along the path."""
     from hapticdb.exact.sweep import sweep as sweep_path
 
@@ -312,6 +323,7 @@ def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Findings:
             tool = tool_of(request.tool, motion.tool_unit, points, None, has_surface=True)
             warn_of_size(env, tool, selection.excluded)
             shell = tool.shell
+        envelope = _envelope(env, job, shell, stored, about=motion.about)
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
                 env, shell, job.poses, where=selection.where, exclude=selection.exclude,
@@ -322,7 +334,7 @@ def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Findings:
             )  # fmt: skip
     if env.store.revision() != found.revision:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
-    return _Findings(job, shell, found, perf_counter() - began)
+    return _Findings(job, shell, found, perf_counter() - began, envelope)
 
 
 def _show_batch(findings: Sequence[_Findings]) -> None:

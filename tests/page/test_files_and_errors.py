@@ -14,6 +14,7 @@ from children import until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
 from hapticdb.exact.path import ToolPath
 from hapticdb.exact.swept import Gap
+from hapticdb.page.panels.sweeps import SECONDS
 from hapticdb.page.panels.touch import HIGHEST, PART
 from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.page.wording import FAULT, error_text
@@ -165,19 +166,28 @@ def test_browser_dragged_part_alone_hidden(scene: Path) -> None:
         assert person.told == []
 
 
-@pytest.mark.parametrize(("hits", "told"), [(True, "hits ball at 50 %"), (False, "clear by 3 mm")])
+@pytest.mark.parametrize(
+    ("verdict", "told"),
+    [
+        ("hits", "hits ball at 50 %"),
+        ("clear", "clear by 3 mm"),
+        ("not decided", "hapticdb sweep has no time limit"),
+    ],
+)
 def test_browser_sweep_verdict_shown(
-    scene: Path, monkeypatch: pytest.MonkeyPatch, hits: bool, told: str
+    scene: Path, monkeypatch: pytest.MonkeyPatch, verdict: str, told: str
 ) -> None:
     with page_of(scene) as (site, person, browser):
         choose(browser, "box.stl")
         (ball,) = (obj for obj in site.objects.values() if obj.link.endswith("/ball.stl"))
 
-        def found(_: object, shell: hapticdb.PointShell, poses: Any, **__: object) -> Any:  # noqa: ANN401 - as `sweep`
+        def found(_: object, shell: hapticdb.PointShell, poses: Any, **options: Any) -> Any:  # noqa: ANN401 - as `sweep`
             path = ToolPath.of(poses, shell.points, np.zeros(3))
             place = place_at(ball, 0.5, path, 0.003)
             gap = Gap(0.003, 0.003, place)
-            return swept(path, hits=(place,)) if hits else swept(path, gap=gap)
+            is_stopped = verdict == "not decided" and options["seconds"] == SECONDS
+            hits = (place,) if verdict == "hits" else ()
+            return swept(path, hits=hits, gap=gap, is_stopped=is_stopped)
 
         monkeypatch.setattr("hapticdb.page.panels.sweeps.sweep", found)
         person.press("Run the sweep")

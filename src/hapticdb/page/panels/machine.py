@@ -17,7 +17,7 @@ from hapticdb.page import checks, colours
 from hapticdb.page.browser import Browser
 from hapticdb.page.drawing import add_marks, put_at
 from hapticdb.page.panels.jobs import PanelJob, Progress
-from hapticdb.page.panels.sweeps import swept_html
+from hapticdb.page.panels.sweeps import SECONDS, swept_html
 from hapticdb.page.site import TICKS
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import note_html
@@ -116,7 +116,7 @@ class MachinePanel:
         with open_environment(site.url, read_only=True) as env:
             return sweep_machine(
                 env, self._machine, self._q, at=at, exclude=self._browser.excluded_ids,
-                progress=progress,
+                seconds=SECONDS, progress=progress,
             )  # fmt: skip
 
     def _show(self, found: Swept) -> None:

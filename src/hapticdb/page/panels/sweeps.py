@@ -25,6 +25,8 @@ Floats = NDArray[np.float64]
 
 MOST_NAMED = 8
 """Greatest number of listed hits."""
+SECONDS = 60.0
+"""Time limit of a sweep, as of a search by the command line: others wait for its thread."""
 COLOURS = {0: "#1f8a4c", 1: "#c62838", 3: "#a8730f", 4: "#a8730f"}
 """Colours of verdicts, by exit status."""
 DIRECTIONS = {
@@ -79,8 +81,9 @@ class SweepPanel:
                 poses = _path(first, DIRECTIONS[word], length, hand, middle)
                 present = [i for i in exclude if i in site.objects]
                 return shell, sweep(
-                    env, shell, poses, exclude=present, seated=is_seated, progress=progress
-                )
+                    env, shell, poses, exclude=present, seated=is_seated, seconds=SECONDS,
+                    progress=progress,
+                )  # fmt: skip
 
         self._work.begin(run, lambda found: self._show(*found, name))
 
@@ -129,6 +132,7 @@ def swept_html(swept: Swept, line: str, name: str) -> str:
         for place in swept.hits[:MOST_NAMED]
     )
     more = len(swept.hits) - MOST_NAMED
+    line = line.replace("give more --seconds", "hapticdb sweep has no time limit")
     return (
         '<div style="margin:2px 12px;font-size:0.85em">'
         f'<b style="color:{COLOURS[swept.verdict.exit_status]}">'

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from hapticdb.ingest.files import ImportCallback
 
-NEW_LINE = "\n"
 COLOURS = {0: 32, 1: 31}
 """Green and red of a terminal, by a verdict's exit code; others are yellow, 33."""
 ASCII = {"─": "-", "…": "...", "µ": "u", "±": "+-", "³": "3"}
@@ -40,7 +39,7 @@ GAP = 3
 
 def note(text: str) -> None:
     """Print one line on standard error."""
-    print(f"hapticdb: {printable(' '.join(text.split(NEW_LINE)))}", file=sys.stderr)
+    print(f"hapticdb: {printable(' '.join(text.splitlines()))}", file=sys.stderr)
 
 
 @contextmanager

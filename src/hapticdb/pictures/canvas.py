@@ -62,12 +62,10 @@ class Canvas:
         low = np.maximum(np.ceil(placed[..., :2].min(axis=1) - 0.5), 0.0).astype(np.int64)
         sides = np.floor(placed[..., :2].max(axis=1) + 0.5).clip(max=self._depths.shape[::-1]) - low
         seen = np.flatnonzero((sides[:, 0] > 0.0) & (sides[:, 1] > 0.0))
-        if not len(seen):
-            return
         # triangles of about the same width and height are drawn together
         codes = np.ceil(np.log(sides[seen]) / np.log(GROWTH)).astype(np.int64) @ (64, 1)
         order = np.argsort(codes)
-        for some in np.split(seen[order], np.flatnonzero(np.diff(codes[order])) + 1):
+        for some in np.split(seen[order], np.flatnonzero(np.diff(codes[order])) + 1)[: len(seen)]:
             width, height = sides[some].max(axis=0).astype(int).tolist()
             for part in np.array_split(some, max(1, -(-len(some) * width * height // AT_ONCE))):
                 self._fill(placed[part], colours[part], low[part], (width, height))

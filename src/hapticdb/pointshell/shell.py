@@ -249,13 +249,12 @@ class PointShell:
         try:
             with Path(path).open("rb") as file:
                 is_zip = zipfile.is_zipfile(file)
-                file.seek(0)
                 if is_zip:  # its directory, before anything is unpacked
                     sizes = (one.file_size for one in zipfile.ZipFile(file).infolist())
                     n_points = (sum(sizes) - HEAD_BYTES) // POINT_BYTES
                     if n_points > MAX_POINTS:
                         raise FileError(f"{path}: {n_points} points: a shell has 1 to {MAX_POINTS}")  # noqa: TRY301 - likewise
-                    file.seek(0)
+                file.seek(0)
                 saved = np.load(file, allow_pickle=False) if is_zip else {}
                 if str(saved.get("format")) != FORMAT:
                     raise FileError(f"{path}: not a saved shell, or of another version")  # noqa: TRY301 - told as it is

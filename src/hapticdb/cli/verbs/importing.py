@@ -1,7 +1,7 @@
 """The verb import."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from math import ceil, log2
@@ -148,7 +148,7 @@ def _warn_of_voxels(size: float, bits: int) -> None:
         render.note(f"voxels of {1e9 * size:.3g} nm: is --unit right?")
 
 
-def _lines(file: str, report: "FileReport") -> list[str]:
+def _lines(file: str, report: "FileReport") -> Iterator[str]:
     """Result of a file, and remarks on it, indented."""
     if report.status == "complete":
         there = render.counted(report.present, "object")
@@ -166,12 +166,11 @@ def _lines(file: str, report: "FileReport") -> list[str]:
             line += f"; {count} {words}" if count else ""
     if report.still_removed:
         line += f"; {render.counted(report.still_removed, 'removed part')} left out"
-    lines = []
+    yield line
     if report.is_unit_assumed:
-        lines.append("its unit is not known: its numbers are taken as metres; --unit gives another")
+        yield "  its unit is not known: its numbers are taken as metres; --unit gives another"
     if report.chord:
-        lines.append(f"chord error of its triangles: {length_text(report.chord)}")
+        yield f"  chord error of its triangles: {length_text(report.chord)}"
     if report.defects:
-        lines.append(f"found in the file: {report.defects.describe()}")
-    lines += [f"note: {note}" for note in report.notes]
-    return [line, *(f"  {one}" for one in lines)]
+        yield f"  found in the file: {report.defects.describe()}"
+    yield from (f"  note: {note}" for note in report.notes)

@@ -83,13 +83,10 @@ def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> 
         rows.append((name, f"{median:.0f}", f"{p99:.0f}", *counts, f"{base / median:.1f}"))
     keys = np.median([query.ranges for query in measured.queries[YARDSTICK]])
     one = measured.imported
-    rows_there = render.counted(one.rows, "row")
     render.say()
-    render.say(f"{one.engine}, {one.layout} layout, {rows_there}; warm, strategies in turns")
-    render.say(
-        f"a frame: {len(scene.shell)} points, {keys:.0f} distinct keys, {hits:.0f} hits (medians)"
-    )
-    render.say()
+    render.say(f"{one.engine}, {one.layout} layout, {render.counted(one.rows, 'row')}; warm")
+    medians = f"{keys:.0f} distinct keys, {hits:.0f} hits (medians)"
+    render.say(f"a frame: {len(scene.shell)} points, {medians}; strategies in turns")
     columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")
     render.table(columns, rows)
     used = Counter(query.strategy for query in measured.queries["auto"])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from banded import write_points
-from feel.tools import flat_tool
+from feel.ground import flat_tool
 from hapticdb import Grid, TangentPlane
 from hapticdb.devices.handle import Handle
 from hapticdb.devices.profiles import SCRIPTED

@@ -1,8 +1,9 @@
 """Peers that answer many poses of a tool: whether it touches the car, and how far it is from it.
 
 Each has all of the car's triangles in memory. python-fcl and coal compare them with the tool's
-triangles, a pose at a time: with one tree of boxes around all of the car, and with a tree for each
-part below a tree of the parts. Open3D looks for the triangle nearest to each of the shell's points.
+triangles, a pose at a time, with one tree of boxes around all of the car; coal also with a tree for
+each part below a tree of the parts (python-fcl was never faster so). Open3D looks for the triangle
+nearest to each of the shell's points.
 """
 
 from collections.abc import Sequence
@@ -41,7 +42,8 @@ class BatchPeer:
     """Another program that answers poses (B, 4, 4), world_from_tool, on its own.
 
     Its subclasses answer one pose, or all of them. Parameters: corners (T, 3, 3) of each part, and
-    the tool, metres. Raises PeerMissingError if its package is not installed.
+    the tool, metres. Raises PeerMissingError if its package is not installed. A distance is in
+    metres, 0 or less where the tool touches.
     """
 
     name: str
@@ -50,11 +52,9 @@ class BatchPeer:
         raise NotImplementedError
 
     def touches_at(self, pose: Floats) -> bool:
-        """Whether the tool touches at one pose."""
         raise NotImplementedError
 
     def distance_at(self, pose: Floats) -> float:
-        """Distance of the tool at one pose, metres; 0 or less if it touches."""
         raise NotImplementedError
 
     def touches(self, points: Floats, poses: Floats) -> NDArray[np.bool_]:  # noqa: ARG002
@@ -62,7 +62,6 @@ class BatchPeer:
         return np.array([self.touches_at(pose) for pose in poses], dtype=np.bool_)
 
     def distances(self, points: Floats, poses: Floats) -> Floats:  # noqa: ARG002
-        """Distance (B,) of the tool, metres; 0 or less if it touches."""
         return np.array([self.distance_at(pose) for pose in poses])
 
 
@@ -74,9 +73,6 @@ class FclBatch(BatchPeer):
     def __init__(self, parts: Sequence[Floats], tool: Mesh) -> None:
         self._fcl = _loaded("fcl")
         self._tool = self._object(*tool)
-        self._take(parts)
-
-    def _take(self, parts: Sequence[Floats]) -> None:
         self._car = self._object(*mesh_of(np.concatenate(parts)))
         self._collision = self._fcl.CollisionRequest(num_max_contacts=1)
         self._distance = self._fcl.DistanceRequest()
@@ -101,31 +97,6 @@ class FclBatch(BatchPeer):
         self._move(pose)
         result = self._fcl.DistanceResult()
         return float(self._fcl.distance(self._car, self._tool, self._distance, result)) / MM
-
-
-class FclPartsBatch(FclBatch):
-    """python-fcl with a tree of boxes for each part, below a tree of the parts."""
-
-    name = "python-fcl, parts"
-
-    def _take(self, parts: Sequence[Floats]) -> None:
-        self._all = [self._object(*mesh_of(part)) for part in parts]
-        self._parts = self._fcl.DynamicAABBTreeCollisionManager()
-        self._parts.registerObjects(self._all)
-        self._parts.setup()
-        self._collision = self._fcl.CollisionRequest(num_max_contacts=1)
-
-    def touches_at(self, pose: Floats) -> bool:
-        self._move(pose)
-        asked = self._fcl.CollisionData(request=self._collision)
-        self._parts.collide(self._tool, asked, self._fcl.defaultCollisionCallback)
-        return bool(asked.result.is_collision)
-
-    def distance_at(self, pose: Floats) -> float:
-        self._move(pose)
-        asked = self._fcl.DistanceData()
-        self._parts.distance(self._tool, asked, self._fcl.defaultDistanceCallback)
-        return float(asked.result.min_distance) / MM
 
 
 def tree_of_boxes(vertices: Floats, faces: NDArray[np.int64]) -> Any:  # noqa: ANN401 - no types
@@ -225,4 +196,4 @@ class Open3DBatch(BatchPeer):
         return self.distances(points, poses) <= self.close
 
 
-PEERS = (FclBatch, FclPartsBatch, CoalBatch, CoalPartsBatch, Open3DBatch)
+PEERS = (FclBatch, CoalBatch, CoalPartsBatch, Open3DBatch)

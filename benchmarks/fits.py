@@ -106,7 +106,7 @@ def measured(folder: Path, data: Path, name: str, bits: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, print, and fill the table of docs/paths.md."""
-    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
+    argparse.ArgumentParser(description=records.first_line(__doc__)).parse_args()
     data = Path(os.environ["HAPTICDB_TEST_DATA"], "fits")
     with tempfile.TemporaryDirectory() as folder:
         rows = [measured(Path(folder), data, name, BITS) for name in FITS]

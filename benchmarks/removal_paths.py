@@ -12,24 +12,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import coal
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from trimesh import creation
 from trimesh.transformations import translation_matrix
 
 import hapticdb
 import page_tables
 import records
-from batch_peers import mesh_of, tree_of_boxes
 from hapticdb import Environment, Extraction, GridOptions, ImportOptions
 from hapticdb.extraction.extraction_results import RemovalPath
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.sample import write_sample
+from test_mesh_proofs import coal_distance, tree_in_mm
 
-Floats = NDArray[np.float64]
 BITS = 11
 SECONDS = 60.0
 MOTIONS = 20_000
@@ -91,16 +88,11 @@ def plug_scene() -> Any:  # noqa: ANN401 - trimesh has no types
     return scene
 
 
-def measured(url: Path, question: Question, seconds: float, motions: int) -> dict[str, Any]:
-    """Search a way out; for a path that is found, ask coal, too."""
-    with hapticdb.open(url, read_only=True) as env:
-        found = hapticdb.extract(
-            env, *question.words, exclude=question.exclude, seconds=seconds, motions=motions
-        )
-        return _record(env, question, found)
-
-
-def _record(env: Environment, question: Question, found: Extraction) -> dict[str, Any]:
+def measured(env: Environment, question: Question) -> dict[str, Any]:
+    """Search a removal path; of a path that is found, the distance by coal, too."""
+    found = hapticdb.extract(
+        env, *question.words, exclude=question.exclude, seconds=SECONDS, motions=MOTIONS
+    )
     row: dict[str, Any] = {
         "parts": question.name,
         "verdict": found.verdict,
@@ -111,45 +103,31 @@ def _record(env: Environment, question: Question, found: Extraction) -> dict[str
         "blockers": [[one.object.name, one.pulls] for one in found.blockers[:3]],
     }
     if found.path is not None and found.is_free:
+        way = found.path
         standing = env.select((), (*(obj.id for obj in found.parts), *question.exclude))
-        row |= _of_way(found.path) | by_meshes(env, found, standing)
+        row |= {
+            "how": way.how,
+            "length_m": way.length,
+            "gap_m": way.gap,
+            "touching": [[one.object.name, one.until] for one in way.swept.touching],
+            "mesh_distance_m": by_meshes(env, found, way, standing),
+        }
     return row
 
 
-def _of_way(way: RemovalPath) -> dict[str, Any]:
-    return {
-        "how": way.how,
-        "length_m": way.length,
-        "end_m": way.poses[-1][:3, 3].tolist(),
-        "gap_m": way.gap,
-        "touching": [[one.object.name, one.until] for one in way.swept.touching],
-    }
-
-
 def by_meshes(
-    env: Environment, found: Extraction, standing: Sequence[hapticdb.Object]
-) -> dict[str, Any]:
-    """Least distance of the exact meshes on the path, of what is not touched at its start.
-
-    coal measures in millimetres: in metres its tolerances are as large as small triangles.
-    """
-    way, surface = found.path, found.shell.surface
-    assert way is not None
+    env: Environment, found: Extraction, way: RemovalPath, standing: Sequence[hapticdb.Object]
+) -> float:
+    """Least distance of the exact meshes on the path, of what is not touched at its start."""
+    surface = found.shell.surface
     assert isinstance(surface, Surface)
-    path = way.swept.path
-    ways = np.linspace(0.0, path.length, MOST_POSES)
     touched = {one.object.id for one in way.swept.touching}
     free = [obj for obj in standing if obj.id not in touched]
     others = [part.triangles() for _, part in parts_of(env.store, free)]
-    tool = tree_of_boxes(*mesh_of(1e3 * surface.triangles))
-    scene = tree_of_boxes(*mesh_of(1e3 * np.concatenate(others)))
-    here, request = coal.Transform3s(), coal.DistanceRequest()
-    least = np.inf
-    for pose in path.at(ways):
-        there = coal.Transform3s(pose[:3, :3].copy(), 1e3 * pose[:3, 3])
-        result = coal.DistanceResult()
-        least = min(least, coal.distance(scene, here, tool, there, request, result))
-    return {"mesh_distance_m": 1e-3 * float(least)}
+    scene, tool = tree_in_mm(np.concatenate(others)), tree_in_mm(surface.triangles)
+    path = way.swept.path
+    poses = path.at(np.linspace(0.0, path.length, MOST_POSES))
+    return min(coal_distance(scene, tool, pose) for pose in poses)
 
 
 def measure(
@@ -164,28 +142,18 @@ def measure(
     url = folder / "scene.db"
     hapticdb.import_files(url, files, ImportOptions(grid=GridOptions(bits=bits)))
     with hapticdb.open(url, read_only=True) as env:
-        voxel_size = env.grid.voxel_size
-    found: dict[str, Any] = records.conditions() | {
-        "inputs": {"model": file.name, "bits": bits, "seconds": SECONDS, "voxel_m": voxel_size},
-        "rows": [],
-    }
-    for question in questions:
-        found["rows"].append(measured(url, question, SECONDS, MOTIONS))
-        print(_line(found["rows"][-1]), flush=True)
-    return found
-
-
-def _line(row: dict[str, Any]) -> str:
-    said = f"{row['parts']}: {row['verdict']}, {row['s']:.1f} s"
-    if "length_m" in row:
-        said += f", {1000 * row['length_m']:.0f} mm"
-        said += f", gap {1000 * row['gap_m']:.2f} mm; meshes {1000 * row['mesh_distance_m']:.2f} mm"
-    return said + "".join(f"; {name} stops {pulls}" for name, pulls in row["blockers"][:1])
+        inputs = {"model": file.name, "bits": bits, "seconds": SECONDS}
+        inputs["voxel_m"] = env.grid.voxel_size
+        rows = []
+        for question in questions:
+            rows.append(measured(env, question))
+            print(rows[-1], flush=True)
+    return records.conditions() | {"inputs": inputs, "rows": rows}
 
 
 def main() -> None:
     """Measure, print, and fill the table of docs/paths.md."""
-    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
+    argparse.ArgumentParser(description=records.first_line(__doc__)).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         found = {"removal_paths": measure(Path(folder), None, BITS, SAMPLE)}
     records.write(Path("results"), found)

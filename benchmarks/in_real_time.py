@@ -8,7 +8,6 @@ same poses, and so does the law distance. Sessions: `hapticdb feel` as a user ru
 on PostgreSQL. Edits: how soon a session feels another one's commit.
 """
 
-import argparse
 import contextlib
 import json
 import os
@@ -142,7 +141,7 @@ def environments(folder: Path, model: Path, bits: int) -> Iterator[dict[str, str
     options = ImportOptions(grid=GridOptions(bits=bits, extent=EXTENT))
     file = str(folder / "environment.db")
     hapticdb.import_files(file, [model], options)
-    binaries = max(find_binaries(), key=lambda found: found.major)
+    binaries = find_binaries()[0]
     with serving(folder / "server", binaries, SETTINGS) as server:
         url = with_environment(server.conninfo(), "environment")
         hapticdb.import_files(url, [model], options)
@@ -178,17 +177,13 @@ def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, and fill the tables of docs/realtime.md."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="short sessions, a coarse sample")
-    given = parser.parse_args()
-    out = Path("results-quick" if given.quick else "results")
+    is_quick, out = records.asked(__doc__, "short sessions, a coarse sample")
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    real = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), CAR)
-    model = None if given.quick or not real.is_file() else real
+    model = None if is_quick else records.data(CAR)
     with tempfile.TemporaryDirectory(prefix="hapticdb-realtime-") as folder:
-        results = measure(Path(folder), model, QUICK if given.quick else Effort())
+        results = measure(Path(folder), model, QUICK if is_quick else Effort())
     records.write(out, {"realtime": results})
-    if not given.quick:
+    if not is_quick:
         page_tables.refill("docs/realtime.md", out)
 
 

@@ -5,6 +5,6 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
 
-from postgres_servers import Binaries, find_binaries, serving
+from postgres_servers import PORT, USER, Binaries, Server, find_binaries, serving
 
-__all__ = ["Binaries", "find_binaries", "serving"]
+__all__ = ["PORT", "USER", "Binaries", "Server", "find_binaries", "serving"]

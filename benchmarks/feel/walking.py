@@ -1,7 +1,7 @@
 """A walk over a model: one path of the hand, and the force on it."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -37,19 +37,8 @@ NEAR = 48.0
 """Voxels around the path whose cells are fetched."""
 
 
-class Walk(NamedTuple):
-    """A hand's way over a model.
-
-    hand (M, 3): positions, metres, one a period; speed, m/s; voxel_size, metres.
-    """
-
-    hand: Floats
-    speed: float
-    voxel_size: float
-
-
-def plan_walk(env: Environment, places: int = PLACES) -> Walk:
-    """A path over the model's largest objects, pressed in and smoothed."""
+def plan_walk(env: Environment, places: int) -> tuple[Floats, float]:
+    """Way (M, 3) of the hand over the model's largest objects, one place a period; speed, m/s."""
     size = env.grid.voxel_size
     shell = PointShell.sphere(RADIUS * size, POINTS)
     raw = slide_along(env, shell.points, places)[:, :3, 3]
@@ -58,36 +47,31 @@ def plan_walk(env: Environment, places: int = PLACES) -> Walk:
     steps = np.linalg.norm(np.diff(smooth, axis=0), axis=1)
     ways = np.concatenate([[0.0], np.cumsum(steps)])
     speed = float(np.clip(SPEED_LENGTHS * ways[-1], *SPEEDS))
-    count = max(round(ways[-1] / speed * RATE), 2)
-    even = np.linspace(0.0, ways[-1], count)
+    even = np.linspace(0.0, ways[-1], max(round(ways[-1] / speed * RATE), 2))
     hand = np.column_stack([np.interp(even, ways, smooth[:, axis]) for axis in range(3)])
-    return Walk(gaussian_filter1d(hand, 10.0, axis=0, mode="nearest"), speed, size)
-
-
-def descent(env: Environment, walk: Walk) -> Floats:
-    """Straight way (M, 3) of the hand from above all objects, where the tool is free, to the walk.
-
-    A tool that begins in something feels nothing until it is free.
-    """
-    top = max(float(obj.bounds[1, 2]) for obj in env.objects())
-    start = walk.hand[0].copy()
-    start[2] = max(top, start[2]) + (RADIUS + NEAR) * walk.voxel_size
-    return straight(start, walk.hand[0], walk.speed)
+    return gaussian_filter1d(hand, 10.0, axis=0, mode="nearest"), speed
 
 
 def walk_over(url: str | Path, places: int = PLACES) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Walk over an environment: figures, and the force over time."""
+    """Walk over an environment: figures, and the force over time.
+
+    The hand comes straight from above all objects: a tool that begins in something feels nothing
+    until it is free.
+    """
     with Ground(url) as ground:
-        walk = plan_walk(ground.environment, places)
-        lead = descent(ground.environment, walk)
-        apart = max(round(16.0 * ground.size / (walk.speed / RATE)), 1)
-        for place in np.concatenate([lead[::apart], walk.hand[::apart]]):
+        walk, speed = plan_walk(ground.environment, places)
+        start = walk[0].copy()
+        start[2] = max(start[2], *(obj.bounds[1, 2] for obj in ground.environment.objects()))
+        start[2] += (RADIUS + NEAR) * ground.size
+        lead = straight(start, walk[0], speed)
+        apart = max(round(16.0 * ground.size / (speed / RATE)), 1)
+        for place in np.concatenate([lead[::apart], walk[::apart]]):
             ground.fetch(place, NEAR)
         shell = PointShell.sphere(RADIUS * ground.size, POINTS)
         above = np.array([0.0, 0.0, ONSET * ground.size])
         hand = CoupledHand(ground, shell, lead[0] + above)
         hand.lead(lead + above)
-        forces = hand.lead(walk.hand + above)
+        forces = hand.lead(walk + above)
     sizes = np.linalg.norm(forces, axis=1)
     every = max(len(sizes) // MOST_DRAWN, 1)
     times = (np.arange(len(sizes)) / RATE)[::every].tolist()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from banded import write_points
-from feel.ground import flat_tool
+from feel.ground import PITCH, flat_tool
 from hapticdb import Grid, TangentPlane
 from hapticdb.devices.handle import Handle
 from hapticdb.devices.profiles import SCRIPTED
@@ -97,7 +97,7 @@ def requested(world: World, hand: Pressing, seconds: float = 1.0) -> WorkerReque
     if world.table.has_distances:
         law = DistanceField()
         coupling = Coupling().settled(SCRIPTED, 200.0, 1.0, 0.01)
-    shell = flat_tool(6, SIZE, np.eye(3), pitch=0.4)
+    shell = flat_tool(6, 0.4 / PITCH * SIZE, np.eye(3))
     slot = SlotRequest(0, world.table.join(), world.grid, shell, coupling)
     alone = DeviceRequest(slot, world.table, hand, Handle(), seconds, staleness=1e9)
     shared = SharedTable.create(1, N_RING)

@@ -1,5 +1,6 @@
 """Ways out of scenes made of boxes, whose ways are known by construction."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -190,6 +191,11 @@ def test_extract_time_limit_of_sweeps(tmp_path: Path, monkeypatch: pytest.Monkey
     found = found_in(lid(tmp_path, 0.03), "lid", motions=0, seconds=10.0)
     assert found.verdict == "not decided"
     assert now[0] <= 11.5
+    assert (line := extraction_line(found)).startswith("not decided: a path, straight, ")
+    assert line.count("not decided") == 1
+    assert "give more --seconds: pot blocks" in line
+    line = extraction_line(replace(found, path=None, is_planned=True, motions=1))
+    assert "and 1 motion; give more" in line
 
 
 def test_extract_missing_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

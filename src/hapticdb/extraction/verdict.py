@@ -24,7 +24,8 @@ def extraction_line(found: Extraction) -> str:
     how = hows.get(removal.how, f"by {len(removal.poses)} poses")
     path = f"{how}, {length_text(removal.length)}"
     if not found.is_free:
-        return f"not decided: a path {path} long: {verdict_line(removal.swept, found.shell)}"
+        why = verdict_line(removal.swept, found.shell).removeprefix("not decided: ")
+        return f"not decided: a path, {path}: {why}{_blocked(found)}"
     does = "comes out" if removal.swept.comes_out else "slides"
     does = does if found.to is None else "reaches the pose"
     return f"{does} {path}{overlaps_text(removal.swept)}{_proved(removal)}"
@@ -40,17 +41,23 @@ def _proved(removal: RemovalPath) -> str:
 
 def _no_path(found: Extraction) -> str:
     pulls = f"{found.pulls} straight pull{'s' * (found.pulls != 1)}"
-    tried = f"{pulls} and {found.motions:,} motions" if found.is_planned else pulls
+    motions = f"{found.motions:,} motion{'s' * (found.motions != 1)}"
+    tried = f"{pulls} and {motions}" if found.is_planned else pulls
     if found.is_planned and not found.motions:
         tried = f"{pulls}, none of which gets free of what is near"
     said = f"no path found in {tried}"
     if found.is_out_of_time:
         said = f"not decided: the time was over; {said}; give more --seconds"
+    return said + _blocked(found)
+
+
+def _blocked(found: Extraction) -> str:
+    """Objects that stop pulls, after a colon; empty without one."""
     if not found.blockers:
-        return said
+        return ""
     first = found.blockers[0]
     others = names_of([one.object for one in found.blockers[1:]])
-    return f"{said}: {first.object.name} blocks {first.pulls} of the pulls" + (
+    return f": {first.object.name} blocks {first.pulls} of the pulls" + (
         f", then {others}" if others else ""
     )
 

@@ -183,7 +183,7 @@ def _show(found: "Extraction") -> list[tuple[str, str]]:
     """Print the blockers; returns the figures of the search."""
     from hapticdb.exact.sweep_report import names_of
 
-    if found.path is None:
+    if not found.is_free:
         rows = (
             (one.object.id, one.object.name, f"{one.pulls} of {found.pulls}")
             for one in found.blockers[:MOST_BLOCKERS]

@@ -114,7 +114,9 @@ def test_groups_of_one_part_against_many(tmp_path: Path) -> None:
     with made(tmp_path / "plate.db", boxes) as env:
         (group,) = grouped(env)
         assert (group.kind, group.part, group.n_parts) == ("overlapping", "plate", 4)
-        assert group.title() == "plate and 3 others"
+        assert group.title() == "plate, pin0 and 2 others"
+        accept_clash(env, ["plate"], ["pin0"], "pressed")
+        assert grouped(env)[0].title() == "plate, pin1 and 2 others"  # the open ones first
     del boxes["pin2"]
     with made(tmp_path / "fewer.db", boxes) as env:
         found = grouped(env)

@@ -53,13 +53,14 @@ class Group(NamedTuple):
         return len({i for one in self.pairs for i in one[:2]})
 
     def title(self) -> str:
-        """Names of the first pair, or of the part, and the number of others."""
+        """Names of the first pair, and the number of others."""
         worst, more = self.pairs[0], len(self.pairs) - 1
         a, b = (name or "(gone)" for name in (worst.a_name, worst.b_name))
         if self.kind == Kind.DUPLICATE and more:
             return f"{a}, {self.n_parts} at one place"
         if self.part is not None:
-            return f"{self.part} and {self.n_parts - 1} others"
+            partner = b if worst.a_name == self.part else a
+            return f"{self.part}, {partner} and {self.n_parts - 2} others"
         return f"{a}, {b}" + (f" and {more} alike" if more else "")
 
     def length_text(self) -> str:

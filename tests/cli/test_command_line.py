@@ -27,8 +27,7 @@ from hapticdb.store import connect
 from hapticdb.store.base import LAYOUTS
 from hapticdb.units import UNITS
 
-VERBS = [verb.__name__.rstrip("_") for verb in cli.VERBS if verb not in cli.HIDDEN]
-HIDDEN = ("sample",)
+VERBS = [verb.__name__.rstrip("_") for verb in cli.VERBS]
 
 
 # -- help and verbs -------------------------------------------------------------------------------
@@ -38,8 +37,6 @@ def test_main_without_arguments_lists_verbs(run: Run) -> None:
     out = succeeded(run())
     for verb in VERBS:
         assert re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
-    for verb in HIDDEN:
-        assert not re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
 
 
 @pytest.mark.parametrize(
@@ -55,7 +52,7 @@ def test_options_choices_equal_library(choices: object, names: Iterable[str]) ->
 
 
 def test_main_help_example_for_each_verb(run: Run) -> None:
-    for verb in (*VERBS, *HIDDEN):
+    for verb in VERBS:
         out = succeeded(run(verb, "--help"))
         assert max(map(len, out.splitlines())) <= 80
         assert f"Example: hapticdb {verb}" in " ".join(out.split())

@@ -43,10 +43,8 @@ VERBS = (
     extract, move, remove, copy, diff, check, backup, grant, demo, sample,
 )  # fmt: skip
 """Verbs, as listed; their docstrings are their help texts."""
-HIDDEN = {sample}
-"""Verbs omitted from the list of verbs: `demo` writes the sample itself."""
 for verb in VERBS:
-    app.command(verb.__name__.rstrip("_"), hidden=verb in HIDDEN)(command(verb))
+    app.command(verb.__name__.rstrip("_"))(command(verb))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

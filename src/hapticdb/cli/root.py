@@ -87,14 +87,16 @@ def root(
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")] = False,
 ) -> None:
-    """Feel a virtual environment too large for memory: haptic queries on an SQL database.
+    """What clashes, what comes out, and how it feels: scenes of CAD parts in an SQL database.
 
     First steps:
 
     \b
-      hapticdb demo
-      hapticdb import car.db car.glb --bits 11
-      hapticdb touch car.db --tool spanner.stl --poses path.csv
+      hapticdb sample sample
+      hapticdb import car.db sample/car.glb
+      hapticdb clashes car.db
+      hapticdb extract car.db body/trunk_lid
+      hapticdb view car.db --tool sample/spanner.stl
 
     A URL instead of a path opens an environment on PostgreSQL:
     'postgresql://user@host/database?environment=NAME'.

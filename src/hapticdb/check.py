@@ -35,7 +35,7 @@ from hapticdb.store.base import (
 from hapticdb.store.connect import open_store
 from hapticdb.store.engines import DropsRows
 from hapticdb.store.pairs import PairRow
-from hapticdb.store.parsing import Checksum
+from hapticdb.store.parsing import Checksum, cause_of
 
 ROWS_AT_ONCE = 1 << 14
 """Rows of a batch; 1,000 bytes each with unpacked distances."""
@@ -115,7 +115,7 @@ def check_environment(
             report.url = store.url
             _check(store, report, progress)
     except DamagedError as error:
-        report.add(_cause(error))
+        report.add(cause_of(error))
     return report
 
 
@@ -161,7 +161,7 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
                 report.add(finding)
             objects = {obj.id: obj for obj in store.objects()}
         except DamagedError as error:
-            report.add(_cause(error))
+            report.add(cause_of(error))
             return
         report.objects = len(objects)
         if not store.wants_distances and any(obj.has_distances for obj in objects.values()):
@@ -179,7 +179,7 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
                 report.pairs += [fault.row] if fault.row else []
             store.rules()
         except DamagedError as error:
-            report.add(_cause(error))
+            report.add(cause_of(error))
 
 
 # -- the log of changes --------------------------------------------------------------------------
@@ -342,7 +342,7 @@ def _surface_findings(
         try:
             shape = unpacked_part(store.url, same[0], store.surfaces([digest])[digest])
         except DamagedError as error:
-            yield _cause(error)
+            yield cause_of(error)
             continue
         for obj in same:
             part = replace(shape, name=obj.name, world_from_part=obj.transform)
@@ -392,24 +392,14 @@ class _Places:
         """Lowest voxels (n, 3) of rows."""
         grid = self._grid
         if not self._is_brick:
-            voxels: NDArray[np.int64] = grid.decode(keys)
-            return voxels
+            return grid.decode(keys)
         level = max(grid.bits - BRICK_BITS, 0)
-        bricks: NDArray[np.int64] = curves.decode(keys, level, grid.curve_code)
-        return bricks << BRICK_BITS
+        return np.asarray(curves.decode(keys, level, grid.curve_code) << BRICK_BITS)
 
 
 def _voxel_box(grid: Grid, obj: Object) -> NDArray[np.int64]:
     """Lowest and highest voxel (2, 3) of an object's bounds, with a margin of a voxel."""
     with np.errstate(invalid="ignore", over="ignore"):
         places = (obj.bounds - np.array(grid.origin)) / grid.voxel_size
-    box: NDArray[np.int64] = np.floor(places.clip(-1.0, grid.side)).astype(np.int64)
-    box += np.array([[-1], [1]])
-    return box
-
-
-def _cause(error: DamagedError) -> str:
-    """Text between the brackets of a message, since the report names the environment itself."""
-    text = str(error)
-    start, end = text.find("is damaged ("), text.rfind("): ")
-    return text[start + len("is damaged (") : end] if 0 <= start < end else text
+    box = np.floor(places.clip(-1.0, grid.side)).astype(np.int64)
+    return np.asarray(box + np.array([[-1], [1]]))

@@ -25,7 +25,7 @@ class BackupReport(NamedTuple):
 
 
 class Engine(Protocol):
-    """Operations of an engine on URLs, before a store is open.
+    """Operations of an engine on URLs, before a store is open: methods of its class of stores.
 
     URLs are unchanged user input. All methods may connect.
 

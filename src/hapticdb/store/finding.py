@@ -55,8 +55,12 @@ def find_objects(store: HasObjects, words: Words) -> list[Object]:
     """
     checked = checked_words(words)
     if all(isinstance(word, int) for word in checked):
-        ids = {word: None for word in checked if isinstance(word, int)}
-        return [_object_of(store, object_id) for object_id in sorted(ids)]
+        found = []
+        for object_id in sorted({word for word in checked if isinstance(word, int)}):
+            if not -MOST_IDS <= object_id < MOST_IDS:
+                raise no_object(object_id, store.url)
+            found.append(store.object(object_id))
+        return found
     return Listing(store.objects(), store.url).chosen(checked)
 
 
@@ -145,12 +149,6 @@ def _read(text: str) -> list[int | str]:
 def is_id(piece: str) -> bool:
     """Whether a text is an object id: digits without leading zeros."""
     return piece.isascii() and piece.isdecimal() and (piece[0] != "0" or piece == "0")
-
-
-def _object_of(store: HasObjects, object_id: int) -> Object:
-    if not -MOST_IDS <= object_id < MOST_IDS:
-        raise no_object(object_id, store.url)
-    return store.object(object_id)
 
 
 def _named_like(objects: Sequence[Object], pattern: str) -> list[Object]:

@@ -32,7 +32,7 @@ INSERT INTO pair ({COLUMNS}) {{values}}
 """Writes rows; `values` in an engine's own form."""
 COUNT = "UPDATE pair SET at_least = (SELECT count(*) - 1 FROM pair) WHERE (a, b) = (%s, %s)"
 """Stores the number of other rows in the mark's row."""
-HELD = "SELECT setting, revision FROM pair WHERE (a, b) = (%s, %s)"
+MARKED = "SELECT setting, revision FROM pair WHERE (a, b) = (%s, %s)"
 MARK = (0, 1)
 """Key of the mark's row, which is no pair. No object has the id 0."""
 

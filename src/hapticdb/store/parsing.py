@@ -4,7 +4,6 @@ An environment may be damaged or malicious. Every value, apart from the rows of 
 right type within its bounds here, or a DamagedError with its location.
 """
 
-import contextlib
 import json
 import math
 import sys
@@ -56,6 +55,13 @@ Floats = NDArray[np.float64]
 def damaged(url: str, cause: str) -> DamagedError:
     """Build the error for an environment with broken contents."""
     return DamagedError(f"{url} is damaged ({cause}): restore a copy or import the files again")
+
+
+def cause_of(error: DamagedError) -> str:
+    """Text between the brackets of a message, for a report that names the environment itself."""
+    text = str(error)
+    start, end = text.find("is damaged ("), text.rfind("): ")
+    return text[start + len("is damaged (") : end] if 0 <= start < end else text
 
 
 class Checksum:
@@ -323,7 +329,8 @@ def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:
     keys = _int64s(bounds)
     if keys is None or len(keys) < 2 or (np.diff(keys) < 0).any() or not _is_count(n_rows):
         raise damaged(
-            url, "stored statistics that are no ascending keys; 'hapticdb info --calibrate' renews"
+            url,
+            "stored statistics are no ascending keys; 'hapticdb info --calibrate' renews them",
         )
     return Histogram(keys, cast("int", n_rows), "kept")
 
@@ -332,24 +339,9 @@ def figures_of(url: str, text: object) -> Mapping[str, float]:
     """Parse the stored figures of a cost model: finite numbers by name."""
     figures = _json_of(text)
     if figures is None or not all(_is_finite(value) for value in figures.values()):
-        raise damaged(url, "stored costs that are no numbers; 'hapticdb info --calibrate' renews")
+        cause = "stored costs are no numbers; 'hapticdb info --calibrate' renews them"
+        raise damaged(url, cause)
     return cast("Mapping[str, float]", figures)
-
-
-def findings_of_stored(
-    url: str, histograms: Iterable[Sequence[Any]], costs: Iterable[Sequence[Any]]
-) -> Iterator[str]:
-    """Faults of stored histograms (bounds, n_rows) and cost figures (text,), a line each."""
-    for row in histograms:
-        with contextlib.suppress(DamagedError):
-            histogram_of(url, *row)
-            continue
-        yield "stored statistics are no ascending keys; 'hapticdb info --calibrate' renews them"
-    for row in costs:
-        with contextlib.suppress(DamagedError):
-            figures_of(url, *row)
-            continue
-        yield "stored costs are no numbers; 'hapticdb info --calibrate' renews them"
 
 
 def number_of(url: str, value: object, what: str) -> int:

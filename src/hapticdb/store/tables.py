@@ -21,6 +21,7 @@ from hapticdb.store.base import (
     CELL_SHIFT,
     NO_KEYS,
     Change,
+    Columns,
     Freshness,
     Histogram,
     Keys,
@@ -34,8 +35,8 @@ from hapticdb.store.covering import EVERYWHERE, Ranges, object_ranges
 from hapticdb.store.pairs import (
     ALL,
     COUNT,
-    HELD,
     MARK,
+    MARKED,
     Ids,
     Mark,
     MaybeMark,
@@ -50,6 +51,13 @@ Result = TypeVar("Result")
 Form = Literal["lookup", "lookup_one", "scan", "rows_of", "after"]
 """Queries for rows, named as the methods of `Tables`; `lookup_one`: a statement a key."""
 
+TABLES: dict[Columns, Layout] = {"voxel": "voxel", "brick": "brick", "distances": "brick"}
+HELD: dict[Columns, str] = {
+    "voxel": "TRUE",
+    "brick": "occupancy IS NOT NULL",
+    "distances": "distances IS NOT NULL",
+}
+"""Tables of the reads, and conditions on their rows."""
 INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
 VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s) RETURNING id"""
@@ -308,16 +316,14 @@ class Tables(ABC):
         # read under the write lock: no other write comes between this check and the commit
         known = self.object(record.id)
         check_unwritten(record, known, self.url)
-        gone = self._take(known, ranges or self._ranges_of(known), rows.keys)
+        ranges = ranges or object_ranges(self.grid, self.layout, known)
+        gone = self._take(known, ranges, rows.keys)
         self._do(UPDATE_OBJECT, (*self._contents(record, rows), revision, record.id))
         self._put(rows, record.id)
         # after the update, when only other objects can have the former digest
-        self._drop_surface(known.digest)
+        self._do(DROP_SURFACE, (known.digest, known.digest))
         self._put_surface(record.digest, surface)
         self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
-
-    def _ranges_of(self, known: Object) -> Ranges:
-        return object_ranges(self.grid, self.layout, known)
 
     def remove(self, object_id: int, revision: int | None = None) -> Object:
         def work() -> Object:
@@ -325,9 +331,9 @@ class Tables(ABC):
             known = self.object(object_id)
             check_unwritten(replace(known, revision=revision or 0), known, self.url)
             surface = self.surfaces([known.digest]).get(known.digest)
-            gone = self._take(known, self._ranges_of(known))
+            gone = self._take(known, object_ranges(self.grid, self.layout, known))
             self._do("DELETE FROM object WHERE id = %s", (object_id,))
-            self._drop_surface(known.digest)
+            self._do(DROP_SURFACE, (known.digest, known.digest))
             self._log(own, "remove", object_id, gone)
             return replace(known, surface=surface)
 
@@ -337,7 +343,7 @@ class Tables(ABC):
         self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
     ) -> MaybeMark:
         def work() -> MaybeMark:
-            mark, row = Mark.after(self._do(HELD, MARK), was, now)
+            mark, row = Mark.after(self._do(MARKED, MARK), was, now)
             self._exchange_pairs([*gone, MARK], [*rows, row])
             self._do(COUNT, MARK)
             return mark
@@ -377,10 +383,6 @@ class Tables(ABC):
         """Write a surface, unless its digest has one."""
         if surface is not None and self._do(LACKS_SURFACE, (digest,)) == [(True,)]:
             self._do("INSERT INTO surface VALUES (%s, %s)", (digest, surface))
-
-    def _drop_surface(self, digest: str) -> None:
-        """Delete a surface without objects."""
-        self._do(DROP_SURFACE, (digest, digest))
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
         """Record the keys touched by a write."""
@@ -422,9 +424,16 @@ class Tables(ABC):
         return revision, n_rows, bounds
 
     def findings(self) -> Iterator[str]:
-        kept = self._rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
-        costs = self._rows(f"SELECT figures{self.AS_TEXT} FROM cost")
-        yield from parsing.findings_of_stored(self.url, kept, costs)
+        stored: tuple[tuple[str, Callable[..., object]], ...] = (
+            ("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL", parsing.histogram_of),
+            (f"SELECT figures{self.AS_TEXT} FROM cost", parsing.figures_of),
+        )
+        for text, parse in stored:
+            for row in self._rows(text):
+                try:
+                    parse(self.url, *row)
+                except DamagedError as error:
+                    yield parsing.cause_of(error)
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         text = f"SELECT figures{self.AS_TEXT} FROM cost WHERE machine = %s"

@@ -17,7 +17,6 @@ from hapticdb.store.base import (
     Layout,
     LocatedShell,
     Rows,
-    Store,
     is_ascending,
     joined,
     no_rows,
@@ -48,7 +47,9 @@ id."""
 
 
 class PostgresStore(ServerTables):
-    """An environment on a PostgreSQL server: `open` or `create`."""
+    """An environment on a PostgreSQL server; its class is the engine, for URLs of servers."""
+
+    title = "PostgreSQL"
 
     def __init__(self, connection: ServerConnection) -> None:
         super().__init__(connection)
@@ -67,7 +68,6 @@ class PostgresStore(ServerTables):
 
     @classmethod
     def open(cls, url: str, *, read_only: bool = False) -> "PostgresStore":
-        """Open an existing environment."""
         connection = environment_schema.opened(url, read_only=read_only)
         try:
             return cls(connection)
@@ -79,9 +79,19 @@ class PostgresStore(ServerTables):
     def create(
         cls, url: str, grid: Grid, layout: Layout = "brick", *, distances: bool = False
     ) -> "PostgresStore":
-        """Make a new environment with its grid: a schema, created whole or not at all."""
+        """A schema, created whole or not at all."""
         environment_schema.created(url, grid, layout, distances=distances)
         return cls.open(url)
+
+    @staticmethod
+    def exists(url: str) -> bool:
+        return environment_schema.exists(url)
+
+    @staticmethod
+    def grant(url: str, role: str, right: Right) -> None:
+        with environment_schema.connected(url) as connection:
+            environment_schema.check(connection)
+            rights.grant(connection, role, right)
 
     def discard(self) -> None:
         self._loading.drop_unused()
@@ -197,25 +207,4 @@ def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
     return [wire.int8(low), wire.int8(high), wire.Parameter(wire.BYTEA, bits)]
 
 
-class _PostgresEngine:
-    """Operations on URLs of servers."""
-
-    title = "PostgreSQL"
-
-    def open(self, url: str, *, read_only: bool) -> Store:
-        return PostgresStore.open(url, read_only=read_only)
-
-    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
-        """Create a schema, whole or not at all."""
-        return PostgresStore.create(url, grid, layout, distances=distances)
-
-    def exists(self, url: str) -> bool:
-        return environment_schema.exists(url)
-
-    def grant(self, url: str, role: str, right: Right) -> None:
-        with environment_schema.connected(url) as connection:
-            environment_schema.check(connection)
-            rights.grant(connection, role, right)
-
-
-ENGINE = _PostgresEngine()
+ENGINE = PostgresStore

@@ -20,8 +20,6 @@ from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.server_connection import ServerConnection
 
 REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
-DIGEST_DIGITS = 32
-"""Hex digits of the digest in place of a long name. Fewer: equal channels become possible."""
 LISTENING_S = 1.0
 """Longest delay of a commit without a notification, where LISTEN works, s."""
 POLLING_S = 0.02
@@ -36,7 +34,7 @@ def channel_of(environment: str) -> str:
     if len(channel.encode()) <= LONGEST_NAME:
         return channel
     # a dot instead of the underscore: never equal to the channel of a short name
-    return f"hapticdb.{hashlib.sha256(environment.encode()).hexdigest()[:DIGEST_DIGITS]}"
+    return f"hapticdb.{hashlib.sha256(environment.encode()).hexdigest()[:32]}"
 
 
 class Watch:

@@ -47,7 +47,8 @@ def back_up(
         if replace and real.exists():
             shutil.copymode(real, unfinished)
         # content before name: after a power cut the name must not lead to an empty file
-        _sync(unfinished)
+        with unfinished.open("rb") as file:
+            os.fsync(file.fileno())
         if replace:
             _put_in_place(unfinished, real)
         else:
@@ -101,7 +102,12 @@ def _copied(
             contextlib.closing(apsw.Connection(str(unfinished))) as made,
         ):
             _copy_pages(connection, made, progress)
-            _check_pages(made)
+            found = made.execute("PRAGMA quick_check(1)").fetchall()
+            if found != [("ok",)]:
+                raise DamagedError(
+                    f"what was to be copied is damaged ({found[0][0]}): copy an older copy, or "
+                    "import the files again"
+                )
         file.verify()  # the path must still lead to the copied file
         if file.stamp is not None:
             file.check_stamp()
@@ -111,7 +117,7 @@ def _copied(
 def _copy_pages(source: apsw.Connection, made: apsw.Connection, progress: Progress | None) -> None:
     made.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     made.execute("PRAGMA journal_mode = OFF").fetchall()
-    made.execute("PRAGMA synchronous = OFF")  # the file is still private; `_sync` comes later
+    made.execute("PRAGMA synchronous = OFF")  # the file is still private, and synced later
     with made.backup("main", source, "main") as copying:
         while not copying.done:
             # in steps, for progress and Ctrl-C; the transaction above keeps them of one moment
@@ -119,22 +125,6 @@ def _copy_pages(source: apsw.Connection, made: apsw.Connection, progress: Progre
             if progress is not None:
                 done = copying.page_count - copying.remaining
                 progress(done * PAGE_BYTES, copying.page_count * PAGE_BYTES)
-
-
-def _check_pages(made: apsw.Connection) -> None:
-    """Refuse a copy with a damaged structure."""
-    found = made.execute("PRAGMA quick_check(1)").fetchall()
-    if found != [("ok",)]:
-        raise DamagedError(
-            f"what was to be copied is damaged ({found[0][0]}): copy an older copy, or import the "
-            "files again"
-        )
-
-
-def _sync(path: Path) -> None:
-    """Write a file without open connections to disk (fsync)."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
 
 
 @contextlib.contextmanager

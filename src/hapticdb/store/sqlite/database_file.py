@@ -228,12 +228,6 @@ def _sweep_unfinished(path: Path) -> None:
             left.unlink(missing_ok=True)
 
 
-def roll_back(connection: apsw.Connection) -> None:
-    """Undo a transaction, unless SQLite itself has done so, as on a full disk."""
-    if connection.in_transaction:
-        connection.execute("ROLLBACK")
-
-
 def network_of(path: Path) -> str | None:
     """Type of the network file system of a file's folder, None on a local one."""
     device = path.resolve().parent.stat().st_dev

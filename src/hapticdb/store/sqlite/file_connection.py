@@ -84,7 +84,8 @@ class FileConnection:
                 self.file.verify()
                 yield
             except BaseException:
-                sqlite_file.roll_back(self.driver)
+                if self.driver.in_transaction:  # else SQLite has done so, as on a full disk
+                    self.driver.execute("ROLLBACK")
                 raise
             self.driver.execute("COMMIT")
             # again: the path may have changed during the transaction

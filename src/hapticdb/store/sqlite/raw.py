@@ -15,7 +15,6 @@ from pathlib import Path
 import apsw
 
 READ_MAIN = apsw.SQLITE_OPEN_MAIN_DB | apsw.SQLITE_OPEN_READONLY
-DESCRIPTORS = Path("/proc/self/fd")
 PAGE_BYTES = 8192
 """Bytes of a page: the paper's block size."""
 
@@ -47,24 +46,16 @@ def read_bytes(path: Path, amount: int, offset: int = 0) -> bytes:
             raise OSError(errno.EIO, os.strerror(errno.EIO), str(error)) from error
 
 
-def descriptor_of(identity: tuple[int, int]) -> int | None:
-    """A descriptor of this process for the file of this device and inode, if any."""
-    for entry in DESCRIPTORS.iterdir():
-        with contextlib.suppress(OSError):  # closed since it was listed
-            status = os.fstat(int(entry.name))
-            if (status.st_dev, status.st_ino) == identity:
-                return int(entry.name)
-    return None
-
-
 def forget_pages(path: Path) -> None:
     """Drop the operating system's cached pages of a database opened by this process."""
     status = path.stat()
-    descriptor = descriptor_of((status.st_dev, status.st_ino))
-    if descriptor is not None:
-        # first: pages that are not yet on disk cannot be dropped
-        os.fsync(descriptor)
-        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+    for descriptor in map(int, os.listdir("/proc/self/fd")):  # noqa: PTH208 - numbers
+        with contextlib.suppress(OSError):  # closed since it was listed
+            if os.path.samestat(os.fstat(descriptor), status):
+                # first: pages that are not yet on disk cannot be dropped
+                os.fsync(descriptor)
+                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+                return
 
 
 def sync_folder(path: Path) -> None:

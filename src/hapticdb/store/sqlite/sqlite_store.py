@@ -29,7 +29,6 @@ from hapticdb.store.base import (
     LocatedShell,
     Progress,
     Rows,
-    Store,
     no_rows,
 )
 from hapticdb.store.engines import BackupReport, unknown_scheme
@@ -38,8 +37,8 @@ from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.file_connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables.file_tables import FileTables
-from hapticdb.store.sqlite.tables.ranges import HELD, LISTS, TABLES, RangeStatements
-from hapticdb.store.tables import Form
+from hapticdb.store.sqlite.tables.ranges import LISTS, RangeStatements
+from hapticdb.store.tables import HELD, TABLES, Form
 
 # CROSS JOIN fixes the order: keys outside, for each a descent of the index
 LOOKUP: dict[Columns, str] = {
@@ -66,7 +65,9 @@ KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
 
 
 class SQLiteStore(FileTables):
-    """An environment in one SQLite file: `open` or `create`."""
+    """An environment in one SQLite file; its class is the engine, for paths and URLs of files."""
+
+    title = "SQLite"
 
     def __init__(self, connection: FileConnection) -> None:
         super().__init__(connection)
@@ -80,9 +81,8 @@ class SQLiteStore(FileTables):
         self.watch, self.has_changed = connection.watch, connection.has_changed
 
     @classmethod
-    def open(cls, path: str | Path, *, read_only: bool = False) -> "SQLiteStore":
-        """Open an existing environment."""
-        connection = FileConnection(Path(path), read_only=read_only)
+    def open(cls, url: str | Path, *, read_only: bool = False) -> "SQLiteStore":
+        connection = FileConnection(_path_of(url), read_only=read_only)
         try:
             with sqlite_file.named_errors(connection.url):
                 return cls(connection)
@@ -92,16 +92,26 @@ class SQLiteStore(FileTables):
 
     @classmethod
     def create(
-        cls, path: str | Path, grid: Grid, layout: Layout = "brick", *, distances: bool = False
+        cls, url: str | Path, grid: Grid, layout: Layout = "brick", *, distances: bool = False
     ) -> "SQLiteStore":
-        """Make a new environment with its grid; its file is created whole or not at all."""
+        """Its file is created whole or not at all."""
         row = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, int(distances))
 
         def fill(connection: apsw.Connection) -> None:
             connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)", row)
 
-        sqlite_file.create_file(Path(path), fill)
-        return cls.open(path)
+        sqlite_file.create_file(_path_of(url), fill)
+        return cls.open(url)
+
+    @staticmethod
+    def exists(url: str) -> bool:
+        return _path_of(url).exists()
+
+    @staticmethod
+    def back_up(url: str, copy: str, *, replace: bool, progress: Progress | None) -> BackupReport:
+        from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
+
+        return back_up(_path_of(url), _path_of(copy), replace=replace, progress=progress)
 
     def discard(self) -> None:
         self._connection.file.verify()  # another environment's file must not be deleted
@@ -153,7 +163,10 @@ class SQLiteStore(FileTables):
 
     def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         found = self._connection.fetch(*sqlite_force.hits_statement(self.layout, frame))
-        pairs = _pairs_of(self.url, found)
+        try:
+            pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise parsing.damaged(self.url, f"a row of another kind: {error}") from error
         return pairs[:, 0] - 1, pairs[:, 1].copy()
 
 
@@ -183,42 +196,12 @@ def _rows_of(url: str, found: list[Any], columns: Columns) -> Rows:
     return rows
 
 
-def _pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:
-    """Pairs (n, 2) of integers from a statement."""
-    try:
-        return np.array(found, dtype=np.int64).reshape(-1, 2)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise parsing.damaged(url, f"a row of another kind: {error}") from error
+ENGINE = SQLiteStore
 
 
-class _SQLiteEngine:
-    """Operations on paths and URLs of files."""
-
-    title = "SQLite"
-
-    def open(self, url: str, *, read_only: bool) -> Store:
-        return SQLiteStore.open(_path_of(url), read_only=read_only)
-
-    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
-        return SQLiteStore.create(_path_of(url), grid, layout, distances=distances)
-
-    def exists(self, url: str) -> bool:
-        return _path_of(url).exists()
-
-    def back_up(
-        self, url: str, copy: str, *, replace: bool, progress: Progress | None
-    ) -> BackupReport:
-        from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
-
-        return back_up(_path_of(url), _path_of(copy), replace=replace, progress=progress)
-
-
-ENGINE = _SQLiteEngine()
-
-
-def _path_of(url: str) -> Path:
+def _path_of(url: str | Path) -> Path:
     """Path of the file that a URL or a path names."""
-    text = url
+    text = str(url)
     if text.startswith(PREFIX):
         text = text.removeprefix(PREFIX)
     elif "://" in text:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from hapticdb.store.base import LAYOUTS, Columns, Layout
 from hapticdb.store.parsing import NO_VOXEL
+from hapticdb.store.tables import HELD, TABLES
 
-TABLES: dict[Columns, Layout] = {"voxel": "voxel", "brick": "brick", "distances": "brick"}
 PACKED: dict[Columns, str] = {
     "voxel": "array_agg(z_val), array_agg(id)",
     "brick": "array_agg(z_val), array_agg(id), string_agg(occupancy, '')",
@@ -17,12 +17,6 @@ PACKED: dict[Columns, str] = {
        string_agg(coalesce(occupancy, '\\x{NO_VOXEL.hex()}'), ''), string_agg(distances, ''),
        array_agg(coalesce(octet_length(distances), 0)::bigint)""",
 }
-HELD: dict[Columns, str] = {
-    "voxel": "true",
-    "brick": "occupancy IS NOT NULL",
-    "distances": "distances IS NOT NULL",
-}
-"""Condition on the rows of a read."""
 SEEN = "(SELECT revision FROM environment WHERE environment.id = 1)"
 
 

@@ -67,7 +67,16 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
             cause = "a brick of the wrong length"
             raise parsing.damaged(connection.filename, cause) from error
 
-    is_included = _LastExcluded().is_included
+    last: Keys | None = None
+    excluded: frozenset[int] = frozenset()
+
+    def is_included(exclude: Keys, object_id: int) -> bool:
+        nonlocal last, excluded
+        # by identity, since most frames exclude the same array: called for each row
+        if exclude is not last:
+            last, excluded = exclude, frozenset(exclude.tolist())
+        return object_id not in excluded
+
     connection.create_aggregate_function("force", cast("Any", force), 3)
     connection.create_scalar_function("is_included", cast("Any", is_included), 2)
     connection.create_scalar_function("has_voxel", cast("Any", has_voxel), 2, deterministic=True)
@@ -120,18 +129,3 @@ def _without_excluded(
     included = f"{test} AND is_included(?{len(bindings) + 1}, id)"
     # at the row's own condition, which is inside EXISTS in one of the statements
     return sql.replace(test, included), (*bindings, apsw.pyobject(frame.exclude))
-
-
-class _LastExcluded:
-    """The excluded ids of the last frame as a set; most frames exclude the same ones."""
-
-    def __init__(self) -> None:
-        self._ids: Keys | None = None
-        self._set: frozenset[int] = frozenset()
-
-    def is_included(self, exclude: Keys, object_id: int) -> bool:
-        """Whether an object is not excluded."""
-        # by identity: called for each row, so no comparison of arrays
-        if exclude is not self._ids:
-            self._ids, self._set = exclude, frozenset(exclude.tolist())
-        return object_id not in self._set

@@ -10,6 +10,7 @@ import apsw
 import numpy as np
 
 from hapticdb.store.base import Columns, Keys, Layout, row_shift
+from hapticdb.store.tables import HELD, TABLES
 
 KEY_BITS = 63
 """Value bits of a non-negative int64."""
@@ -19,13 +20,6 @@ LISTS: dict[Columns, str] = {
     "brick": "z_val, id, occupancy",
     "distances": "z_val, id, occupancy, distances",
 }
-TABLES: dict[Columns, str] = {"voxel": "voxel", "brick": "brick", "distances": "brick"}
-HELD: dict[Columns, str] = {
-    "voxel": "TRUE",
-    "brick": "occupancy IS NOT NULL",
-    "distances": "distances IS NOT NULL",
-}
-"""Condition on the rows of a read."""
 # SQLite never reorders a CROSS JOIN, so the rows are in the order of the given keys
 NARROW: dict[Columns, str] = {
     columns: f"""
@@ -72,11 +66,8 @@ class RangeStatements:
             # one carray for both ends: otherwise `nth` is called for each range
             packed = apsw.carray((lows << self._width_bits) | widths)
             return NARROW[columns], (packed, self._width_bits, self._mask)
-        return WIDE[columns], (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)
-
-
-def _ends(highs: Keys) -> object:
-    return apsw.pyobject(highs.tolist())
+        ends = apsw.pyobject(highs.tolist())
+        return WIDE[columns], (apsw.carray(np.ascontiguousarray(lows)), ends, 0)
 
 
 def _nth(values: list[Any], ordinal: int, _: int) -> Any:  # noqa: ANN401 - any SQLite value

@@ -14,7 +14,8 @@ from hapticdb.ingest.geometry import unpacked_part
 from hapticdb.kernels import curves
 from hapticdb.store.base import BRICK_BYTES, Band, Object, Progress, Rows, Store, all_rows
 from hapticdb.store.connect import open_store
-from hapticdb.transfer import Url, is_same_grid, part_of
+from hapticdb.store.engines import Url
+from hapticdb.transfer import is_same_grid, part_of
 
 Pair = tuple[Object, Object]
 Hashes = NDArray[np.uint64]

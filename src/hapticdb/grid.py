@@ -96,20 +96,17 @@ class Grid:
 
     def to_voxel_units(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (..., 3) in metres as multiples of the voxel size from the origin."""
-        scaled: NDArray[np.float64] = (points - np.array(self.origin)) / self.voxel_size
-        return scaled
+        return np.asarray((points - np.array(self.origin)) / self.voxel_size)
 
     def centers(self, ijk: ArrayLike) -> NDArray[np.float64]:
         """Centres (N, 3) in metres of voxels (N, 3)."""
         voxels = np.asarray(ijk, dtype=np.int64)
-        centers: NDArray[np.float64] = np.array(self.origin) + self.voxel_size * (voxels + 0.5)
-        return centers
+        return np.asarray(np.array(self.origin) + self.voxel_size * (voxels + 0.5))
 
     def contains(self, ijk: ArrayLike) -> NDArray[np.bool_]:
         """Whether each voxel (N, 3) lies inside the grid, (N,)."""
         voxels = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
-        inside: NDArray[np.bool_] = np.all((voxels >= 0) & (voxels < self.side), axis=1)
-        return inside
+        return np.asarray(np.all((voxels >= 0) & (voxels < self.side), axis=1))
 
     def encode(self, ijk: ArrayLike) -> NDArray[np.int64]:
         """Keys (N,) of voxels (N, 3); `GridError` for a voxel outside, or not of integers."""

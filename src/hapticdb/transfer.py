@@ -1,6 +1,5 @@
 """Copies environments between engines, layouts and curves."""
 
-import os
 from collections.abc import Iterable
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -22,9 +21,8 @@ from hapticdb.kernels.surfaces import voxelize
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Progress, Rows, Store, joined
 from hapticdb.store.connect import create_store, exists, open_store
+from hapticdb.store.engines import Url
 from hapticdb.store.parsing import Checksum
-
-Url = str | os.PathLike[str]
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,6 @@ from hapticdb.kernels._cache import cache_folder, sources_digest
 
 MOST_BYTES = 256 << 20
 """Bytes of all entries of a kind, at most. Larger: more hits."""
-DIGEST_BYTES = 32
-"""Bytes of a SHA-256, the head of an entry."""
 
 
 def entry_of(kind: str, *shaping: object) -> Path:
@@ -28,7 +26,7 @@ def content_of(entry: Path) -> bytes | None:
     """Content of an entry; None if it is missing or damaged."""
     try:
         with entry.open("rb") as stream:
-            digest, content = stream.read(DIGEST_BYTES), stream.read()
+            digest, content = stream.read(32), stream.read()  # SHA-256, then the content
     except OSError:
         return None
     if hashlib.sha256(content).digest() != digest:

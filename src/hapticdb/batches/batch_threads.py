@@ -44,8 +44,7 @@ ChunkWork = Callable[[ThreadMemory, slice], None]
 def available_jobs(jobs: int | None) -> int:
     """Number of threads: 1 to `MOST_JOBS`, or one for each processor available to this process."""
     if jobs is None:
-        able = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return min(able or 1, MOST_JOBS)
+        return min(len(os.sched_getaffinity(0)), MOST_JOBS)
     if not 1 <= jobs <= MOST_JOBS:
         raise UsageError(f"{jobs} jobs: give 1 to {MOST_JOBS} threads")
     return jobs

@@ -24,6 +24,7 @@ from hapticdb.query.law import ForceLaw
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
+from hapticdb.store.base import NO_KEYS
 from hapticdb.store.filtering import Filter
 
 if TYPE_CHECKING:
@@ -139,7 +140,9 @@ class BatchTool(Closes):
         object.
         """
         places = as_poses(poses)
-        order = self._order_of(places)
+        # a GPU computes in the given order
+        center, grid = self.shell.center, self._residency.grid
+        order = NO_KEYS if self._gpu is not None else order_of(places, center, grid)
         return self._at_one_revision(lambda: self._touch(places, order, objects, progress))
 
     def clearance(
@@ -291,12 +294,6 @@ class BatchTool(Closes):
         from hapticdb.batches.on_gpu import GpuNearest  # noqa: PLC0415 - loads numba.cuda
 
         return GpuNearest(self._frames, self._threads, reach, self._gpu)
-
-    def _order_of(self, places: Floats) -> Ints:
-        """Order of computation on the processors; empty for the GPU, which uses the given order."""
-        if self._gpu is not None:
-            return np.empty(0, dtype=np.int64)
-        return order_of(places, self.shell.center, self._residency.grid)
 
 
 def touch_at(

@@ -26,8 +26,6 @@ UNEVEN = 0.2718
 """Share of a step by which rounding is off a half, where lengths in inches fall."""
 MANY = 3
 """Least number of others in the group of one part."""
-DIGITS = 10
-"""Hexadecimal digits of an id."""
 
 
 class Group(NamedTuple):
@@ -181,4 +179,4 @@ def _rounded(values: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _id(*parts: str) -> str:
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:DIGITS]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:10]

@@ -304,14 +304,11 @@ class _OrderSearch:
         excluded = waiting | self._gone() | self._request.keep
         blockers = [one.object for one in failed.blockers if one.object.id not in excluded]
         for obj in blockers[:MOST_BLOCKERS]:
-            if self._is_over():
+            # sticky: the verdict must say that time ended the search, whenever it is read
+            self.is_spent |= time.monotonic() > self._until
+            if self.is_spent:
                 return
             yield obj
-
-    def _is_over(self) -> bool:
-        # sticky: the verdict must say that time ended the search, whenever it is read
-        self.is_spent |= time.monotonic() > self._until
-        return self.is_spent
 
     def _gone(self) -> frozenset[int]:
         """Ids of the objects removed so far."""
@@ -333,8 +330,12 @@ class _OrderSearch:
         n_gone, obstacles = len(self.steps), frozenset[int]()
         excluded = self._excluded()
         try:
-            if not is_wanted:
-                self._check_something_stands({*excluded, *ids})
+            # of two bodies, each comes out of the other or neither does
+            gone = {*excluded, *ids, *ids_of(self._request.parts)}
+            if not is_wanted and all(obj.id in gone for obj in self._env.objects()):
+                raise UsageError(  # noqa: TRY301 - as errors of the search
+                    "it is the last object that stands beside what is to come out"
+                )
             found = self._searched(ids, motions)
         except UsageError as error:
             if is_wanted:
@@ -366,15 +367,6 @@ class _OrderSearch:
         if motions:
             return known.n_gone == len(self.steps)
         return not any(known.obstacles & {*step.ids} for step in self.steps[known.n_gone :])
-
-    def _check_something_stands(self, excluded: set[int]) -> None:
-        """Refuse to remove the last object other than the requested parts.
-
-        Of two bodies, each comes out of the other or neither does.
-        """
-        excluded |= {*ids_of(self._request.parts)}
-        if all(obj.id in excluded for obj in self._env.objects()):
-            raise UsageError("it is the last object that stands beside what is to come out")
 
     def _searched(self, ids: tuple[int, ...], motions: int) -> Extraction:
         def search(motions: int) -> Extraction:

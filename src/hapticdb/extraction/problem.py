@@ -1,7 +1,6 @@
 """The problem of a search: moving parts, standing objects, and the exit."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -92,20 +91,16 @@ def problem_of(
         *(obj.id for obj in parts), points=MOST_POINTS, spacing=SPACING * env.grid.voxel_size,
         seed=seed, inset=0.0,
     )  # fmt: skip
+    bounds = scene_bounds(standing)
+    assert bounds is not None  # noqa: S101 - there is at least one
     outline = shell.outline
     box = np.stack([outline.min(axis=0), outline.max(axis=0)])
     center = box.mean(axis=0)
     radius = float(np.linalg.norm(outline - center, axis=1).max())
     return Problem(
         env, tuple(parts), tuple(where), excluded, contact, overlap, tuple(standing),
-        _box_of(standing), shell, corners_of(box), center, radius,
+        bounds, shell, corners_of(box), center, radius,
     )  # fmt: skip
-
-
-def _box_of(standing: Sequence[Object]) -> Floats:
-    bounds = scene_bounds(standing)
-    assert bounds is not None  # noqa: S101 - there is at least one
-    return bounds
 
 
 def guarded_shell(shell: PointShell, voxel_size: float) -> PointShell:

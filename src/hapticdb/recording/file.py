@@ -159,7 +159,10 @@ class Recorder(Closes):
         self._made = self.path
         if self._replace and os.path.lexists(self.path):
             self._made = None
-            self._check_old()
+            with self._as_file_errors("replace"), io.FileIO(self.path, "rb") as old:
+                start = old.read(len(MAGIC))
+            if start and start[: len(OLDER)] != OLDER and start != MAGIC:
+                raise FileError(f"{self.path} is no recording of hapticdb: give another name")
             self._made = self.path.with_name(f".{self.path.name}.{os.getpid()}.new")
         elif os.path.lexists(self.path):
             self._made = None
@@ -195,7 +198,10 @@ class Recorder(Closes):
         if n:
             self._write(frames[:n].tobytes())
             self._n_written += n
-            self._take_the_name()
+            if self._made is not None and self._made != self.path:
+                with self._as_file_errors():
+                    self._made.replace(self.path)
+                self._made = None
         if n < len(frames):
             self.ended = (
                 f"{self.path}: the recording ends after {self._n_written:,} frames, {reason}"
@@ -253,23 +259,10 @@ class Recorder(Closes):
         except FileError as error:
             self.ended = str(error)
 
-    def _check_old(self) -> None:
-        """Refuse to replace a file other than a recording."""
-        with self._as_file_errors("replace"), io.FileIO(self.path, "rb") as old:
-            start = old.read(len(MAGIC))
-            if start and start[: len(OLDER)] != OLDER and start != MAGIC:
-                raise FileError(f"{self.path} is no recording of hapticdb: give another name")
-
     def _restore_old(self) -> None:
         """Remove the new file if no frame was written; the old recording stays."""
         if self._made is not None and self._made != self.path:
             self._made.unlink(missing_ok=True)
-
-    def _take_the_name(self) -> None:
-        if self._made is not None and self._made != self.path:
-            with self._as_file_errors():
-                self._made.replace(self.path)
-            self._made = None
 
     def _room(self) -> tuple[int, str]:
         """Bytes free for frames, and the words for their limit."""

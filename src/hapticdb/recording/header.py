@@ -40,6 +40,10 @@ MOST_BYTES = 1 << 32
 ROWS_AT = 64
 """Alignment of the first row, bytes: a cache line."""
 
+TEXTS = ("environment", "version", "started", "frames_on", "build")
+VALUES = ("revision", "rate", "where", "exclude", "coupling")
+"""Fields of a header that are in the file as they are."""
+
 Value = str | int | float | bool | None | list[Any] | dict[str, Any]
 
 
@@ -119,10 +123,9 @@ class Header:
         """Bytes of the header."""
         shell = self.shell
         text = json.dumps(
-            {
-                "environment": self.environment,
+            {name: getattr(self, name) for name in (*TEXTS, *VALUES)}
+            | {
                 "grid": asdict(self.grid),
-                "revision": self.revision,
                 "shell": {
                     "points": len(shell), "is_closed": shell.is_closed, "link": shell.link,
                     "seed": shell.seed,
@@ -130,14 +133,6 @@ class Header:
                 "law": self.law.name,  # type: ignore[attr-defined]
                 "stiffness": self.law.stiffness,
                 "rendering": self.rendering,
-                "rate": self.rate,
-                "where": self.where,
-                "exclude": self.exclude,
-                "coupling": self.coupling,
-                "frames_on": self.frames_on,
-                "version": self.version,
-                "build": self.build,
-                "started": self.started,
                 "start": [len(part) for part in self.start],
                 "row": FRAME.descr,
             }
@@ -186,6 +181,8 @@ class Header:
             n_points = index(made["points"])
             if not 0 < n_points <= MAX_POINTS:
                 raise ValueError(f"{n_points} points")  # noqa: TRY301 - as below
+            plain: dict[str, Any] = {name: str(given[name]) for name in TEXTS}
+            plain |= {name: given[name] for name in VALUES}
             at = 48 * n_points + 24
             numbers = np.frombuffer(blobs[:at], dtype="<f8").reshape(-1, 3)
             points, normals, center = np.split(numbers, [n_points, 2 * n_points])
@@ -194,9 +191,8 @@ class Header:
                 start.append(blobs[at : at + length])
                 at += length
             return cls(
-                environment=given["environment"],
+                **plain,
                 grid=Grid(grid["voxel_size"], grid["origin"], index(grid["bits"]), grid["curve"]),
-                revision=given["revision"],
                 shell=PointShell(
                     points,
                     normals,
@@ -205,16 +201,8 @@ class Header:
                     str(made["link"]),
                     index(made["seed"]),
                 ),
-                rate=given["rate"],
                 law=law_named(given["law"], given["stiffness"]),
-                where=given["where"],
-                exclude=given["exclude"],
-                coupling=given["coupling"],
-                version=str(given["version"]),
-                started=str(given["started"]),
                 rendering="coupled" if given["rendering"] == "coupled" else "direct",
-                frames_on=str(given["frames_on"]),
-                build=str(given["build"]),
                 start=Start(*start),
             )
         except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:

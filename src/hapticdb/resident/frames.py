@@ -174,11 +174,6 @@ class ResidentFrames:
         find_first_hits(cells, self._row, self.clusters, poses, self.residency.cell_grid, found)
         return found
 
-    def wrenches(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """Wrenches (M, 6) and numbers of hits (M,) at poses, in the form for a replay."""
-        results = self.evaluate(poses)
-        return results.wrenches, results.hits
-
     def fetch(self, poses: Floats) -> int:
         """Make the cells of the first poses resident; returns the number of these poses."""
         residency = self.residency

@@ -10,7 +10,6 @@ RUN = 64
 """Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
 FLAT_RUN = 512
 """Points per transformation without clusters: as many as fit into a processor's L1 cache."""
-NO_RUNS = np.empty(0, dtype=np.int64)
 
 Floats = NDArray[np.float64]
 
@@ -60,9 +59,9 @@ def _blocks_of(spheres: Floats) -> Floats:
 
     The radius has room for the greatest stretch of a pose under `is_rigid`.
     """
-    starts = np.arange(0, len(spheres), BLOCK) if len(spheres) >= BLOCK else NO_RUNS
-    if not len(starts):
+    if len(spheres) < BLOCK:
         return np.zeros((0, 4))
+    starts = np.arange(0, len(spheres), BLOCK)
     low = np.minimum.reduceat(spheres[:, :3], starts, axis=0)
     high = np.maximum.reduceat(spheres[:, :3], starts, axis=0)
     centers = np.repeat(0.5 * (low + high), BLOCK, axis=0)[: len(spheres)]

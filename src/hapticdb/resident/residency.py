@@ -231,7 +231,7 @@ class Residency:
         if read is None:
             _, read = self._follow_writes(cells)
         else:
-            self._publish(NO_KEYS, read)
+            self.writer.publish(NO_KEYS, read, self._urgent, self._revision)
         elapsed = self._clock() - started
         self.n_loaded += len(read.cells)
         return Loaded(len(read.cells), read.n_rows, read.n_ranges, elapsed)
@@ -267,7 +267,8 @@ class Residency:
             writes = writes_since(self.store, self._revision, revision)
             only_written = self._excluded.follow(self.store, writes)
             self._source.exclude = self._excluded.ids
-            self._check_distances(writes if only_written else None)
+            if self.table.has_distances:
+                check_distances(self.store, self.exclude, writes if only_written else None)
             # other objects are felt than before: their cells are in no listed write,
             # so all are doubtful
             if writes is None or not only_written:
@@ -282,13 +283,8 @@ class Residency:
         self._revision, before = revision, self._revision
         self._commit_count = commit_count
         if len(touched) or len(read.cells) or revision != before:
-            self._publish(touched, read)
+            self.writer.publish(touched, read, self._urgent, self._revision)
         return len(writes or ()), read
-
-    def _check_distances(self, changes: Sequence[Change] | None) -> None:
-        """Refuse objects without distances, as `check_distances`, if the table has distances."""
-        if self.table.has_distances:
-            check_distances(self.store, self.exclude, changes)
 
     def _read_all(self, cells: Keys) -> UnpublishedCells:
         """Read cells (n,), batch by batch, while there is room."""
@@ -319,7 +315,3 @@ class Residency:
         # several batches at once: each eviction waits for the readers
         surplus = min(4 * BATCH, self.table.n_slots // 8)
         self.writer.evict_for(n_cells, surplus, self._urgent, self._revision)
-
-    def _publish(self, leaving: Keys, read: UnpublishedCells) -> None:
-        """Publish the removed and added cells, with the present revision."""
-        self.writer.publish(leaving, read, self._urgent, self._revision)

@@ -6,8 +6,6 @@ process, even after a crash.
 
 import mmap
 import os
-import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -234,34 +232,17 @@ class CellTable(Closes):
 
 def is_alive(pid: int) -> bool:
     """Whether a process runs; a zombie (ended, but not yet waited for) does not."""
-    if not _exists(pid):
-        return False
     try:
         status = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:  # no such folder on this system, or another has just waited for a zombie
-        return _exists(pid)
+    except OSError:
+        return False
     # the name before it is the process's own and may contain a parenthesis
     return status.rpartition(")")[2].split()[0] not in {"Z", "X"}
 
 
-def _exists(pid: int) -> bool:
-    """Whether the system knows a process, be it a zombie."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
-
-
 def anonymous_memory(name: str, size: int) -> int:
     """File descriptor of new anonymous memory, filled with zeros."""
-    if sys.platform == "linux":
-        descriptor = os.memfd_create(name)
-    else:
-        with tempfile.TemporaryFile() as file:
-            descriptor = os.dup(file.fileno())
+    descriptor = os.memfd_create(name)
     try:
         os.truncate(descriptor, size)
     except OSError as error:

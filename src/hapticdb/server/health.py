@@ -63,7 +63,8 @@ class HealthChecker:
             if self._last is not None and now - self._last[0] < GOOD_FOR:
                 return self._last[1]
             database, page = await asyncio.gather(self._is_answered(), self._supervisor.answers())
-            are_working = await asyncio.to_thread(self._are_working)
+            sessions = await asyncio.to_thread(self._served.host.sessions)
+            are_working = not any(session.is_over for session in sessions)
             found = Health(database, self._served.host.failure is None, are_working, page)
             if not found.is_well:
                 LOG.warning("a part does not answer", extra=found.words())
@@ -74,10 +75,6 @@ class HealthChecker:
         """Close the connection to the database."""
         self._thread.submit(self._forget)
         self._thread.shutdown(wait=True)
-
-    def _are_working(self) -> bool:
-        """Whether no session has lost its process."""
-        return not any(session.is_over for session in self._served.host.sessions())
 
     async def _is_answered(self) -> bool:
         loop = asyncio.get_running_loop()
@@ -115,7 +112,10 @@ class HostCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield each metric: sums; of times and shares the worst."""
-        figures = self._figures()
+        figures: list[tuple[LoopFigures, dict[str, Any]]] = []
+        for session in self._host.sessions():
+            with contextlib.suppress(UsageError):  # one may end meanwhile
+                figures.append((session.figures(), session.counts()))
         sessions = [loop for loop, _ in figures]
         unknown, held, stale = (
             sum(counts[f"{name}_frames"] for _, counts in figures)
@@ -144,11 +144,3 @@ class HostCollector(Collector):
             ("cells_latency_seconds", "Median of recent batches.", max([0.0, *latencies])),
         ):  # fmt: skip
             yield GaugeMetricFamily(f"hapticdb_{name}", words, float(value))
-
-    def _figures(self) -> list[tuple[LoopFigures, dict[str, Any]]]:
-        """Times and counts of the running sessions; one may end meanwhile."""
-        found = []
-        for session in self._host.sessions():
-            with contextlib.suppress(UsageError):
-                found.append((session.figures(), session.counts()))
-        return found

@@ -74,7 +74,7 @@ async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Even
         ends.push_async_callback(asyncio.to_thread, host.close)
 
         served = Served(access, serving.limits, Metrics(), host)
-        served.figures.add(HostCollector(host))
+        served.figures.registry.register(HostCollector(host))
         supervisor = PageSupervisor(serving.page, partial(_page_request, serving), host.serve)
         served.figures.page_starts.set_function(lambda: supervisor.n_starts)
         ends.push_async_callback(supervisor.stop)

@@ -162,17 +162,12 @@ class Fetcher:
             self._released_at = self._now
             self.table.release_dead()
             self._note_lag()
-        # Only here: the database has answered every query of this round.
-        self._confirm(begun)
-        return is_busy
-
-    def _confirm(self, begun: int) -> None:
-        """Write the time of the last complete answer: the begin of the round, ns."""
-        control = self.table.cells.control
+        # only here: the database has answered every query of this round
         if self._is_confirmed:
             self._confirmed_at = self._now
-            control["is_lost"] = 0
-            control["heartbeat"] = begun
+            control = self.table.cells.control
+            control["is_lost"], control["heartbeat"] = 0, begun
+        return is_busy
 
     def _note_lag(self) -> None:
         """Write to the request queue how far a standby is behind."""

@@ -134,10 +134,6 @@ class Process:
 class _EndQuietly(SystemExit):
     """Ends the process without a message: after a signal, or because the parent has ended."""
 
-    def __init__(self, status: int) -> None:
-        super().__init__(status)
-        self.status = status
-
 
 class MessageSender:
     """Sends messages from a process to its parent."""
@@ -170,7 +166,7 @@ def run(module: str, name: str, starter: int) -> None:
         function: Callable[[Any, MessageSender], None] = getattr(import_module(module), name)
         function(_request(), sender)
     except _EndQuietly as ended:
-        status = ended.status
+        status = int(ended.code or 0)
     except HapticDBError as error:
         sender.send("error", error)
     except BaseException as error:  # noqa: BLE001 - the parent waits, and must learn of any error

@@ -6,15 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats, Ints
 from hapticdb.errors import UsageError
 from hapticdb.query.law import ForceLaw
 from hapticdb.store.base import Object
 from hapticdb.tabular.schema import WRENCH, record
 from hapticdb.tabular.tables import Columns, Tabular, columns_of
 from hapticdb.units import notebook_html
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class TouchedIds(NamedTuple):

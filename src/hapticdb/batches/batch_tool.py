@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.array_types import Bools, Floats, Ints
 from hapticdb.batches.batch_results import ClearanceBatch, TouchBatch, TouchedIds
 from hapticdb.batches.batch_threads import BatchThreads, ThreadMemory, available_jobs
 from hapticdb.batches.order import order_of
@@ -35,9 +36,6 @@ PIECE_CHUNKS = 32
 PIECE, TASK = 1 << 18, 1 << 16
 """Poses of a long batch in one piece here, 60 MB, and in one task of a worker."""
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 PoseCallback = Callable[[int, int], None]
 """Called after each piece with the poses done and their total."""
 BatchDevice = Literal["cpu", "cuda"]

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.batches.batch_results import ClearanceBatch
 from hapticdb.batches.order import not_rigid
 from hapticdb.errors import UsageError
@@ -17,8 +17,6 @@ from hapticdb.pointshell.shape import bvh_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.pointshell.tool_surface import ToolSurface
 from hapticdb.store.base import Object, Store
-
-Floats = NDArray[np.float64]
 
 MET = 1e-9
 """Metres: surfaces that are farther apart do not meet."""

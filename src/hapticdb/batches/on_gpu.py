@@ -8,6 +8,7 @@ import numpy as np
 from numba import config, cuda
 from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.batches.batch_results import TouchBatch
 from hapticdb.batches.batch_threads import BatchThreads
 from hapticdb.batches.order import not_rigid, order_of
@@ -33,8 +34,6 @@ COPIERS = 4
 LEAST_COPIED = 1 << 12
 """Poses of one thread's copy, at least; smaller batches are copied without threads."""
 config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a frame of a small tool needs few blocks, and no warning
-
-Floats = NDArray[np.float64]
 
 
 def check_gpu() -> None:

@@ -1,8 +1,8 @@
 """Distances at many poses: kernels search resident cells, and report missing ones."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats, Ints
 from hapticdb.batches.batch_threads import BatchThreads, ThreadMemory
 from hapticdb.errors import UsageError
 from hapticdb.kernels.resident import cell_table, collisions
@@ -10,9 +10,6 @@ from hapticdb.kernels.resident import nearest_voxels as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.resident.frames import SMALL, ResidentFrames
 from hapticdb.resident.point_runs import spheres_of
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 DEFAULT_REACH = 32
 """Default reach of the search, voxels. Larger: more cells are fetched."""

@@ -1,13 +1,10 @@
 """Broad phase: pairs of objects with near boxes, never too few."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Bools, Floats, Ints
 from hapticdb.kernels.curves import Z_ORDER, encode
 
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 AT_ONCE = 1 << 20
 """Pairs of boxes of a batch. Larger: more memory."""
 BITS = 10

@@ -16,8 +16,8 @@ from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.clashes.broad_phase import FEW, near_pairs
 from hapticdb.clashes.clash_results import Clash, Clashes, Known, accepted, clash_of, shapes_of
 from hapticdb.clashes.rules import Rules, check_clearances
@@ -33,7 +33,6 @@ from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import BECAUSE, KIND, Mark, Outlines, PairRow, Status, StoredPairs
 from hapticdb.verdicts import Kind
 
-Floats = NDArray[np.float64]
 WITHIN = 1e-3
 """Default of the greatest distance of a pair, metres."""
 BUDGET = 256 << 20

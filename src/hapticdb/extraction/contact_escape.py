@@ -9,8 +9,8 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.extraction.directions import (
     AGAINST,
     AXES,
@@ -25,8 +25,6 @@ from hapticdb.extraction.proof import passed, prove
 from hapticdb.extraction.pulls import MOST_OPPOSED, first_run
 from hapticdb.grid import corners_of
 from hapticdb.poses import rotation_of
-
-Floats = NDArray[np.float64]
 
 FARTHEST = 4.0
 """Length of a shift in contact, radii of the part. Larger: longer slots, more poses."""

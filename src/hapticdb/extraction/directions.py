@@ -3,9 +3,8 @@
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from hapticdb.array_types import Floats
 
 N_RANDOM = 40
 """Random directions. Larger: more oblique paths, a slower search."""

@@ -4,16 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hapticdb.array_types import Floats
 from hapticdb.exact.swept import Swept
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
 from hapticdb.units import notebook_html
 from hapticdb.verdicts import PathVerdict
-
-Floats = NDArray[np.float64]
 
 How = Literal["pull", "screw", "plan"]
 

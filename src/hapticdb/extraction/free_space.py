@@ -12,6 +12,7 @@ from contextlib import ExitStack, closing
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats, Ints
 from hapticdb.closing import Closes
 from hapticdb.exact.path import SampledPath
 from hapticdb.extraction.problem import Problem, guarded_shell
@@ -19,9 +20,6 @@ from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 STEP = 0.5
 """Greatest motion between two poses, voxels. Larger: thin objects are missed."""

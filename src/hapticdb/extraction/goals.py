@@ -10,16 +10,14 @@ from collections import Counter
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.extraction.directions import AXES, likely_directions
 from hapticdb.extraction.free_space import FreeSpace, Room
 from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.proof import passed
 from hapticdb.extraction.pulls import Pulls, first_run, shifted
 from hapticdb.grid import corners_of
-
-Floats = NDArray[np.float64]
 
 MOST_GOALS = 6
 """Goals for each rotation of the part, at most. Larger: more alternatives, a later start of the

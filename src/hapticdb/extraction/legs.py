@@ -10,14 +10,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.extraction.contact_escape import EscapePath
 from hapticdb.extraction.directions import AXES
 from hapticdb.extraction.free_space import Room
 from hapticdb.extraction.problem import Exit, Problem
-
-Floats = NDArray[np.float64]
 
 STOPS = (1, 2, 4)
 """Stops on a leg for the start of the next one, tried in turn. More: narrower doors, but the square

@@ -7,8 +7,8 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.errors import HapticDBError
 from hapticdb.extraction.contact_escape import ContactEscape, EscapePath
 from hapticdb.extraction.free_space import FreeSpace, Room
@@ -20,8 +20,6 @@ from hapticdb.extraction.proof import BACK
 from hapticdb.extraction.pulls import Pulls, first_run
 from hapticdb.poses import quaternion_of, rotation_of
 from hapticdb.session.processes.process import Process
-
-Floats = NDArray[np.float64]
 
 MOST_STARTS = 12
 """Starts of the planner, at most. Larger: more directions in one plan."""

@@ -8,12 +8,10 @@ import os
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.errors import MissingExtraError, pip_line
 from hapticdb.session.processes.process import MessageSender, receive_from_parent
-
-Floats = NDArray[np.float64]
 
 SHORTCUTS = 60
 """Attempts to shorten a path. Larger: shorter paths with fewer poses, more motion queries."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.exact.path import ToolPath
@@ -14,8 +15,6 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.attributes import scene_bounds
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
-
-Floats = NDArray[np.float64]
 
 SPACING = 0.5
 """Spacing of the search's points, voxels. Larger: a faster search, more refuted paths."""

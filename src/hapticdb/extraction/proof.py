@@ -5,14 +5,12 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.exact.sweep import sweep
 from hapticdb.extraction.extraction_results import How, RemovalPath
 from hapticdb.extraction.free_space import Room
 from hapticdb.extraction.problem import Problem
-
-Floats = NDArray[np.float64]
 
 LEAST = 0.1
 """Seconds of each sweep, at least."""

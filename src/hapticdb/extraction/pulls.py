@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.extraction.directions import (
     AGAINST,
     ALIKE,
@@ -20,8 +21,6 @@ from hapticdb.extraction.free_space import STEP, FreeSpace
 from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.proof import prove
 from hapticdb.store.base import Progress
-
-Floats = NDArray[np.float64]
 
 GROWTH = 1.2
 """Factor of the start's hits up to which a part slides along its contacts. Larger: more refuted

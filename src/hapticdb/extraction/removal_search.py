@@ -11,8 +11,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hapticdb.array_types import Floats
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.exact.path import checked_poses
@@ -29,8 +30,6 @@ from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 from hapticdb.verdicts import PathVerdict
-
-Floats = NDArray[np.float64]
 
 DEFAULT_SECONDS = 60.0
 """Default time of a search."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.errors import UsageError
 from hapticdb.kernels.force_law import force_range, reads_distances
 from hapticdb.kernels.records.cells import MISSED
@@ -26,8 +27,6 @@ time to clear."""
 SMALL = 16.0
 """Greatest radius (voxels) of a run for which the search for cells uses the run's middle instead of
 its points. Larger: fewer lookups and more unused cells."""
-
-Floats = NDArray[np.float64]
 
 
 class FrameResults(NamedTuple):

@@ -1,8 +1,8 @@
 """A tool as frames hold it: its points in runs."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.kernels.resident.cells import BLOCK, GROUP, SCRATCH_ROWS, Clusters
 from hapticdb.pointshell.shell import PointShell
 
@@ -10,8 +10,6 @@ RUN = 64
 """Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
 FLAT_RUN = 512
 """Points per transformation without clusters: as many as fit into a processor's L1 cache."""
-
-Floats = NDArray[np.float64]
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:

@@ -15,6 +15,7 @@ from typing import Any, NoReturn, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.errors import DamagedError, GridError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.kernels.field import occupancy
@@ -49,7 +50,6 @@ TABLES = (
 """Tables of every environment."""
 NO_VOXEL = bytes(8)
 """Packed occupancy of a brick without a voxel of the object, left out in the tables."""
-Floats = NDArray[np.float64]
 
 
 def damaged(url: str, cause: str) -> DamagedError:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.array_types import Floats
 from hapticdb.grid import CELL_BITS, Grid
 from hapticdb.kernels.field.distance_law import ONSET
 from hapticdb.kernels.records.cells import MOST_OBJECT_REQUESTS
@@ -43,7 +44,6 @@ NEAR = ONSET + 0.87
 law, and half a voxel's diagonal, since the distance counts at the centre of the point's voxel.
 Larger: objects without a force are named, too."""
 
-Floats = NDArray[np.float64]
 Ranked = tuple[Keys, NDArray[np.float64]]
 """Cells (n,) int64 and their urgency (n,), smallest first."""
 

@@ -10,7 +10,7 @@ import pytest
 
 import hapticdb
 from command_line import Run, refused, succeeded
-from hapticdb.cli.verbs.replaying import FRAMES
+from hapticdb.cli.verbs.feeling import FRAMES
 from hapticdb.cli.verbs.touching import CONTACTS, TOUCHED
 from hapticdb.recording.file import Header, Recording
 from hapticdb.recording.frame import FRAME

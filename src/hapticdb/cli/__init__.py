@@ -20,13 +20,11 @@ from hapticdb.cli.verbs.clashing import clashes
 from hapticdb.cli.verbs.copying import copy, diff
 from hapticdb.cli.verbs.editing import move, remove
 from hapticdb.cli.verbs.extracting import extract
-from hapticdb.cli.verbs.feeling import feel
+from hapticdb.cli.verbs.feeling import feel, replay
 from hapticdb.cli.verbs.importing import import_
 from hapticdb.cli.verbs.listing import info, objects
 from hapticdb.cli.verbs.maintenance import backup, check, grant
-from hapticdb.cli.verbs.measuring import distance
-from hapticdb.cli.verbs.reaching import reach
-from hapticdb.cli.verbs.replaying import replay
+from hapticdb.cli.verbs.measuring import distance, reach
 from hapticdb.cli.verbs.sampling import demo, sample
 from hapticdb.cli.verbs.serving import serve, view
 from hapticdb.cli.verbs.sweeping import sweep
@@ -51,13 +49,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line, by default the process's own, and return its exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     is_debugging = "--debug" in takewhile(lambda arg: arg.startswith("-"), args)
-    _print_anything()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # escapes for characters outside the encoding
+            stream.reconfigure(errors="as_ascii")
     try:
         with leaving_in_order(), render.noting_warnings():
             code = app(args, standalone_mode=False, prog_name="hapticdb")
         sys.stdout.flush()
     except (BrokenPipeError, PipeClosedError):
-        _close_stdout()
+        with contextlib.suppress(OSError, ValueError):  # its reader, as `| head`, has closed it
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except (KeyboardInterrupt, Interrupted) as error:
         interrupting.leave()  # a further Ctrl-C would print another line
@@ -89,16 +90,3 @@ def _usage(error: Exception) -> str:
     context = getattr(error, "ctx", None)
     command = getattr(context, "command_path", "hapticdb")
     return f"{text[:1].lower()}{text[1:]}; see '{command} --help'"
-
-
-def _print_anything() -> None:
-    """Replace characters outside the terminal's encoding by ASCII or escapes, without errors."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="as_ascii")
-
-
-def _close_stdout() -> None:
-    """Redirect standard output to the null device: its reader (``| head``) has closed it."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

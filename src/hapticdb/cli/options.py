@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import partial, wraps
 from inspect import Parameter, Signature, signature
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -244,18 +244,11 @@ _ALSO = {"serve": "view", "sample": "demo", "demo": "sample"}
 _ENTRY = re.compile(r"^([a-z_.]+)(?: ([^\[\n]+?))?(?: \[([^]]*)\])?:\s((?:.|\n  )*)", re.MULTILINE)
 
 
-class _Text(NamedTuple):
-    """Help of a parameter: placeholder of its value, default, and words."""
-
-    value: str | None
-    default: str | None
-    words: str
-
-
 _TEXTS = {
-    name: _Text(value or None, default or None, " ".join(words.split()))
+    name: (value or None, default or None, " ".join(words.split()))
     for name, value, default, words in _ENTRY.findall(TEXTS)
 }
+"""Placeholder of the value, default and words of each entry of `TEXTS`."""
 
 
 def command(verb: Callable[..., None]) -> Callable[..., None]:
@@ -288,8 +281,8 @@ def _documented(verb: str, parameter: Parameter, *, is_option: bool) -> Paramete
     """Parameter with typer's annotation: flags, metavar, help, parser."""
     name = parameter.name.rstrip("_")
     keys = (f"{verb}.{name}", f"{_ALSO.get(verb)}.{name}", name)
-    text = next(_TEXTS[key] for key in keys if key in _TEXTS)
-    words, value, parser = text.words, text.value, None
+    value, default, words = next(_TEXTS[key] for key in keys if key in _TEXTS)
+    parser = None
     if value and "/" in value[1:] and value.rpartition("/")[2] in NAMES:
         value, _, unit = value.rpartition("/")
         parse, such = (length_of, "0.2in") if value == "LENGTH" else (point_of, "0,5,0.2in")
@@ -308,7 +301,7 @@ def _documented(verb: str, parameter: Parameter, *, is_option: bool) -> Paramete
         is_either = parameter.annotation == bool | None
         flags = f"{flag}/--no-{name}" if is_either else flag
         info = typer.Option(
-            flags, metavar=value, help=words, show_default=text.default or True, parser=parser
+            flags, metavar=value, help=words, show_default=default or True, parser=parser
         )
     return parameter.replace(
         kind=Parameter.KEYWORD_ONLY, annotation=Annotated[parameter.annotation, info]

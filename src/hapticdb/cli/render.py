@@ -18,6 +18,7 @@ from unicodedata import category, east_asian_width
 
 from hapticdb.tabular.schema import plain
 from hapticdb.tabular.tables import one_line, printable
+from hapticdb.units import place_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -199,8 +200,6 @@ def bytes_text(n: float) -> str:
 
 def box(bounds: "NDArray[np.float64]") -> str:
     """AABB (2, 3), metres, in words: ``4.28 x 1.9 x 1.4 m, from (0, 0, 0) to (4.28, ...)``."""
-    from hapticdb.units import place_text
-
     step = float((bounds[1] - bounds[0]).max()) / 1e5
     low, high = (place_text(corner, step) for corner in bounds.tolist())
     sides = " x ".join(f"{side:.4g}" for side in (bounds[1] - bounds[0]).tolist())

@@ -5,6 +5,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+import hapticdb
+from hapticdb.cli import render
+from hapticdb.errors import ObjectNotFoundError, ReadOnlyError
+
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.store.base import Object
@@ -43,9 +47,6 @@ class FilterOptions:
 
 def opened_to_store(url: str) -> "Environment":
     """Open an environment for writing, to store results; read-only for users without that right."""
-    import hapticdb
-    from hapticdb.errors import ReadOnlyError
-
     try:
         return hapticdb.open(url)
     except ReadOnlyError:
@@ -58,7 +59,6 @@ def chosen(env: "HasObjects", words: Iterable[str], option: str) -> "list[Object
 
 
 def _found(env: "HasObjects", words: list[str], option: str) -> "list[Object]":
-    from hapticdb.errors import ObjectNotFoundError
     from hapticdb.store.finding import find_objects
 
     try:
@@ -69,8 +69,6 @@ def _found(env: "HasObjects", words: list[str], option: str) -> "list[Object]":
 
 def as_named(env: "HasObjects", words: Iterable[str], option: str) -> list[str]:
     """Words of an option; a number that fits only a name becomes a name. Notes such numbers."""
-    from hapticdb.cli import render
-    from hapticdb.errors import ObjectNotFoundError
     from hapticdb.store.finding import NAME, find_objects, is_id
 
     taken = []

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+import hapticdb
 from hapticdb.cli import render
 from hapticdb.cli.tool_options import shell_record, shell_text
+from hapticdb.errors import DatabaseError
 from hapticdb.tabular.schema import plain
 from hapticdb.units import length_text
 
@@ -40,50 +42,47 @@ def note_cost(n_points: int, rate: float, frames_on: str = "cpu", *, reads_dista
         )
 
 
-class SessionPage(NamedTuple):
-    """Report of a session, for printing and for JSON.
+def record_of(report: "Report", shell: "PointShell", path_speed: float | None) -> dict[str, Any]:
+    """Report for JSON; path_speed : as for `show`."""
+    values: dict[str, Any] = {"path_speed": path_speed, "shell": shell_record(shell)}
+    values |= plain(report)
+    values["touched"] = values.pop("objects")
+    return values
 
-    recording : file of its recording; path_speed : assumed for a path without times, m/s.
+
+def show(
+    report: "Report", cells: "ResidentCells", shell: "PointShell", recording: str | None,
+    path_speed: float | None, began: float,
+) -> None:  # fmt: skip
+    """Print the loop's timing next to the empty loop's, then the events of the session.
+
+    recording : file of its recording; path_speed : assumed for a path without times, m/s; began :
+    start of the verb, as of `perf_counter`.
     """
-
-    report: "Report"
-    cells: "ResidentCells"
-    shell: "PointShell"
-    recording: str | None
-    path_speed: float | None
-
-    def record(self) -> dict[str, Any]:
-        """Report for JSON."""
-        values: dict[str, Any] = {"path_speed": self.path_speed, "shell": shell_record(self.shell)}
-        values |= plain(self.report)
-        values["touched"] = values.pop("objects")
-        return values
-
-    def show(self, began: float) -> None:
-        """Print the loop's timing next to the empty loop's, then the events of the session.
-
-        began : start of the verb, as of `perf_counter`.
-        """
-        report, cache = self.report, self.report.cache
-        _show_loops(report)
-        cells, fetched = (render.counted(n, "cell") for n in (cache.resident, cache.loaded))
-        touched = f"{len(report.objects)} touched{_names_after(self.cells, report.objects)}"
-        inside = inside_text(report, self.cells) if report.inside_frames else ""
-        speed = f"{self.path_speed} m/s: the path has no times (column t); --speed"
-        render.facts([
-            ("shell", shell_text(self.shell)),
-            *_frame_facts(report),
-            *_force_facts(report),
-            ("resident", f"{cells} in {cache.budget_bytes / 2**20:.4g} MiB"),
-            ("fetched", f"{fetched}, {1e3 * cache.worst:.3g} ms at worst"),
-            *[("in something", text) for text in (inside,) if text],
-            ("objects", touched),
-            *_exceptional_facts(report),
-            *[("played at", speed) for one in (self.path_speed,) if one is not None],
-            *[("recorded", _recording_text(report, one)) for one in (self.recording,) if one],
-            ("took", f"{perf_counter() - began:.1f} s in all"),
-            *sorted(report.conditions.items()),
-        ])  # fmt: skip
+    cache = report.cache
+    _show_loops(report)
+    resident, fetched = (render.counted(n, "cell") for n in (cache.resident, cache.loaded))
+    frames = report.unknown_frames, report.held_frames, report.hit_frames
+    unknown, held, hit = (render.counted(n, "frame") for n in frames)
+    touched = f"{len(report.objects)} touched{_names_after(cells, report.objects)}"
+    inside = inside_text(report, cells) if report.inside_frames else ""
+    speed = f"{path_speed} m/s: the path has no times (column t); --speed"
+    render.facts([
+        ("shell", shell_text(shell)),
+        ("touching", f"{hit} hit, {report.contact_frames:,} in contact"),
+        ("not known", f"{unknown} with cells that were not in memory yet"),
+        ("force held", f"{held}, {report.stale_frames:,} of them without a database"),
+        *_force_facts(report),
+        ("resident", f"{resident} in {cache.budget_bytes / 2**20:.4g} MiB"),
+        ("fetched", f"{fetched}, {1e3 * cache.worst:.3g} ms at worst"),
+        *[("in something", text) for text in (inside,) if text],
+        ("objects", touched),
+        *_exceptional_facts(report),
+        *[("played at", speed) for one in (path_speed,) if one is not None],
+        *[("recorded", _recording_text(report, one)) for one in (recording,) if one],
+        ("took", f"{perf_counter() - began:.1f} s in all"),
+        *sorted(report.conditions.items()),
+    ])  # fmt: skip
 
 
 def _show_loops(report: "Report") -> None:
@@ -100,17 +99,6 @@ def _show_loops(report: "Report") -> None:
             figures = (f"{1e6 * getattr(spread, field):,.1f}" for spread in spreads)
             rows.append((f"{what} {name}, µs", *figures))
     render.table(("", "session>", "empty loop>")[: 1 + len(loops)], rows)
-
-
-def _frame_facts(report: "Report") -> Facts:
-    """Counts of frames: in contact, with cells missing, with an earlier wrench repeated."""
-    frames = report.unknown_frames, report.held_frames, report.hit_frames
-    unknown, held, hit = (render.counted(n, "frame") for n in frames)
-    return [
-        ("touching", f"{hit} hit, {report.contact_frames:,} in contact"),
-        ("not known", f"{unknown} with cells that were not in memory yet"),
-        ("force held", f"{held}, {report.stale_frames:,} of them without a database"),
-    ]
 
 
 def _force_facts(report: "Report") -> Facts:
@@ -219,9 +207,6 @@ def _in_objects(cells: "ResidentCells", ids: Sequence[int]) -> str:
 
 def _names_after(cells: "ResidentCells", ids: Sequence[int]) -> str:
     """Colon and names of objects, '' for none; ids of new ones while the database is lost."""
-    import hapticdb
-    from hapticdb.errors import DatabaseError
-
     names = {obj.id: obj.name for obj in cells.first_objects}
     with suppress(DatabaseError):
         if not set(ids) <= set(names) and cells.database_lost is None:

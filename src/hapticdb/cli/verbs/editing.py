@@ -1,5 +1,6 @@
 """Verbs for editing an environment: move, remove."""
 
+import hapticdb
 from hapticdb.cli.emit import Output
 from hapticdb.cli.root import left_at
 from hapticdb.cli.selection import chosen
@@ -23,8 +24,6 @@ def move(
     Example: hapticdb move car.db 'body/door_*' --translate 0,0,0.25
     """
     import numpy as np
-
-    import hapticdb
 
     if (translate is None) == (matrix is None):
         raise UsageError("give one of --translate and --matrix")
@@ -54,8 +53,6 @@ def remove(url: str, objects: list[str], *, output: Output) -> None:
 
     Example: hapticdb remove car.db 'wheel_bolt_*'
     """
-    import hapticdb
-
     with hapticdb.open(url) as env:
         for obj in chosen(env, objects, "WORDS"):  # all, or an error before any is removed
             env.remove(obj.id)

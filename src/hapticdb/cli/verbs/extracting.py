@@ -1,5 +1,6 @@
 """The verb extract."""
 
+import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from hapticdb.cli import render
 from hapticdb.cli.emit import Output
 from hapticdb.cli.selection import FilterOptions, ids_of
 from hapticdb.cli.values import MIB, pose_of, refuse
-from hapticdb.errors import UsageError
+from hapticdb.errors import MissingExtraError, UsageError, pip_line
 from hapticdb.tabular.schema import plain
 from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 
@@ -87,9 +88,8 @@ class _Output(Output):
             return
         if not self.animation.lower().endswith(".html"):
             raise UsageError(f"--animation {self.animation}: give a name that ends in .html")
-        from hapticdb.page.animation import check_view
-
-        check_view()
+        if importlib.util.find_spec("viser") is None:
+            raise MissingExtraError(f"an animation needs more packages: {pip_line('view')}")
 
     def files(self, n_steps: int | None) -> list[str]:
         """Files of the path, or of a disassembly's steps: ``out-1.csv`` for ``out.csv``."""

@@ -1,8 +1,10 @@
-"""The verb feel."""
+"""Verbs of sessions: feel, replay."""
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
+from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -11,22 +13,32 @@ import typer
 import hapticdb
 from hapticdb.cli import render, session_report
 from hapticdb.cli.device_options import HandOptions
-from hapticdb.cli.emit import Output
+from hapticdb.cli.emit import STDOUT, Output, TableOutput, open_csv
 from hapticdb.cli.options import FramesOn, LawName, RenderingName
 from hapticdb.cli.root import ended_by_signals, exit_by
 from hapticdb.cli.selection import FilterOptions
 from hapticdb.cli.tool_options import ToolOptions
 from hapticdb.cli.values import MIB, refuse
+from hapticdb.errors import UsageError
+from hapticdb.tabular.schema import COLUMNS
 
 if TYPE_CHECKING:
     from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.query.law import ForceLaw
+    from hapticdb.recording.file import Recording
     from hapticdb.session.coupling import Coupling, Rendering
     from hapticdb.session.report import Report
     from hapticdb.session.session import Session
 
 POLL_EVERY = 0.1
 """Seconds between two polls of the session: delay of its notes."""
+PIECE = 4096
+"""Frames of a block of CSV. Larger: more memory."""
+FRAMES = (
+    "time", "dt", "lateness", "elapsed", "hand", "hand_velocity", "tool", "applied", "spring",
+    "hits", "contacts", "unknown", "deepest", "revision", "buttons", "state",
+)  # fmt: skip
+"""Keys of `replay --csv`, fields of a recorded frame: a row for each frame."""
 
 
 @dataclass(frozen=True)
@@ -137,8 +149,9 @@ def feel(
             ))  # fmt: skip
         with ended_by_signals(session.request_end) as signals:
             report = _waited_for(session, force.stiffness, loop.seconds)
-        page = session_report.SessionPage(report, session.cells, shell, recorded.record, path_speed)
-        output.emit(page.record(), partial(page.show, began))
+        shown = partial(session_report.show, report, session.cells, shell, recorded.record)
+        values = session_report.record_of(report, shell, path_speed)
+        output.emit(values, partial(shown, path_speed, began))
     exit_by(signals, f" after {report.loop.seconds:.3g} s")
     if report.database_lost is not None or report.stale_frames:
         raise typer.Exit(1)
@@ -184,3 +197,49 @@ def _waited_for(session: "Session", stiffness: float | None, seconds: float | No
             if progress is not None:
                 progress(session.n_frames / session.timing.rate, round(seconds or 0.0))
     return report
+
+
+def replay(recording: str, url: str | None = None, *, output: TableOutput) -> None:
+    """Run a recorded session again.
+
+    Tool, wrench and contacts are compared. The exit code is 0 if all frames are equal bit for bit,
+    1 if some differ or there was none to compare; the first difference is printed with its reason.
+    --csv writes the recorded frames and compares nothing; it needs no environment.
+
+    Example: hapticdb replay session.hdbrec car.db
+    """
+    from hapticdb.recording.file import Recording
+
+    if output.csv is not None and (url is not None or output.json):
+        raise UsageError("--csv compares nothing: leave out URL, --json")
+    session = Recording(recording)
+    if session.n_torn:
+        render.note(
+            f"{recording}: its last frame is torn, since the recorder was cut off; "
+            f"{session.n_torn:,} bytes are left out"
+        )
+    if output.csv is not None:
+        _write_frames(session, output.csv)
+        return
+    place: str | Path = url or session.environment_beside()
+    if url is None:
+        render.note(f"{session.path} names {place}, which is opened")
+    with hapticdb.open(place, read_only=True) as env:
+        replayed = hapticdb.replay(session, env)
+    output.emit(replayed, replayed.describe(), int(not replayed.is_equal))
+    if not replayed.is_equal:
+        raise typer.Exit(1)
+
+
+def _write_frames(session: "Recording", target: str) -> None:
+    """Write recorded frames as CSV, block by block; single-precision numbers round-trip."""
+    frames = session.frames()
+    with open_csv(target, FRAMES) as table:
+        assert table is not None  # noqa: S101 - a target was given
+        for at in range(0, len(frames), PIECE):
+            piece = frames[at : at + PIECE]
+            columns = [piece[key].reshape(len(piece), -1).T for key in FRAMES]
+            names = [COLUMNS.get(key, (key,)) for key in FRAMES]
+            table.write(dict(zip(chain(*names), chain(*columns), strict=True)))
+    if target != STDOUT:
+        render.say(f"{target}: {render.counted(len(frames), 'frame')}")

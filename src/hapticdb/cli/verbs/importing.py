@@ -20,7 +20,7 @@ from hapticdb.tabular.schema import plain
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
-    from hapticdb.ingest.files import FileReport, ImportOptions
+    from hapticdb.ingest.files import FileReport
 
 MOST_BITS = 21
 
@@ -73,8 +73,8 @@ def import_(
     Example: hapticdb import 'postgresql://me@host/plant?environment=hall' plant.glb
     """
     from hapticdb.grid import GridOptions
-    from hapticdb.ingest.files import ImportOptions
-    from hapticdb.mesh.parse import READERS
+    from hapticdb.ingest.files import ImportOptions, import_files
+    from hapticdb.mesh.parse import READERS, is_tessellated
     from hapticdb.store.urls import with_partitions
 
     if Path(url).suffix.lower() in READERS:
@@ -86,24 +86,17 @@ def import_(
         grid=GridOptions(grid.bits, grid.voxel_size, grid.extent, grid.origin, grid.curve),
         layout=grid.layout, distances=grid.distances, skip_unusable=True, **vars(reading),
     )  # fmt: skip
-    started = time.perf_counter()
-    reports = _imported(url, files, options)
-    _print_reports(url, files, reports, time.perf_counter() - started, output)
-    if any(report.error for report in reports):
-        raise typer.Exit(2)
-
-
-def _imported(url: str, files: Sequence[str], options: "ImportOptions") -> "list[FileReport]":
-    from hapticdb.ingest.files import import_files
-    from hapticdb.mesh.parse import is_tessellated
-
     if options.chord is not None and not any(map(is_tessellated, files)):
         render.note("--chord changes nothing: it is for STEP and IFC files")
+    started = time.perf_counter()
     with (
         left_at("what went in is whole, and the same command goes on from there"),
         render.import_bar() as progress,
     ):
-        return import_files(url, files, options, progress)
+        reports = import_files(url, files, options, progress)
+    _print_reports(url, files, reports, time.perf_counter() - started, output)
+    if any(report.error for report in reports):
+        raise typer.Exit(2)
 
 
 def _print_reports(

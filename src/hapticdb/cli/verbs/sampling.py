@@ -2,6 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import typer
@@ -32,8 +33,6 @@ def demo(
 
     Example: hapticdb demo demo --bits 11
     """
-    from shlex import quote
-
     import numpy as np
 
     from hapticdb.demo import answers, compare, prepare

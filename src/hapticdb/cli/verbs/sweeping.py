@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
+import hapticdb
 from hapticdb.cli import render
 from hapticdb.cli.emit import TableOutput, open_csv
 from hapticdb.cli.options import UnitName
-from hapticdb.cli.selection import FilterOptions, ids_of
+from hapticdb.cli.selection import FilterOptions, FilterWords, ids_of
 from hapticdb.cli.sweep_lists import ListedSweep, naming, read_sweeps
 from hapticdb.cli.tool_options import tool_of, warn_of_size
 from hapticdb.cli.values import Point, pose_of, refuse
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.cli.selection import FilterWords
     from hapticdb.environment import Environment
     from hapticdb.exact.swept import Swept
     from hapticdb.machines.machine import Machine
@@ -120,7 +120,7 @@ class _Job(NamedTuple):
     request: ListedSweep
     poses: "NDArray[np.float64]"
     parts: list[int]
-    selection: "FilterWords"
+    selection: FilterWords
 
 
 class _Findings(NamedTuple):
@@ -148,7 +148,6 @@ def sweep(
     output: TableOutput,
 ) -> None:
     """See `HELP`."""
-    import hapticdb
     from hapticdb.exact.swept import SWEPT_KEYS
     from hapticdb.tabular.gap_plot import gap_plot
 
@@ -201,10 +200,7 @@ def _check(one: ListedSweep, motion: SweepOptions, batch: str | None, csv: str |
     """UsageError for contradictory options."""
     if batch is not None:
         refuse("with --batch", motion, "gaps")
-        given = {"--tool": one.tool, "--part": one.part, "--path": one.path, "--csv": csv}
-        for name, value in given.items():
-            if value:
-                raise UsageError(f"--batch and {name}: give only one of them")
+        _refuse_both("--batch", one, {"--csv": csv})
         return
     if (one.tool is None) == (not one.part):
         raise UsageError("give one of --tool and --part")
@@ -220,12 +216,16 @@ def _checked_machine(
     """Request for a sweep of a machine; UsageError for contradictory options."""
     if machine.machine is None or machine.joints is None:
         raise UsageError("give --machine, a URDF or MJCF file, and --joints, its path")
-    given = {"--tool": one.tool, "--part": one.part, "--path": one.path, "--batch": batch}
-    for name, value in given.items():
-        if value:
-            raise UsageError(f"--machine and {name}: give only one of them")
+    _refuse_both("--machine", one, {"--batch": batch})
     refuse("with --machine", motion, "about tool_unit path_unit")
     return one._replace(tool=machine.machine, path=machine.joints)
+
+
+def _refuse_both(option: str, one: ListedSweep, more: dict[str, str | None]) -> None:
+    given = {"--tool": one.tool, "--part": one.part, "--path": one.path} | more
+    for name, value in given.items():
+        if value:
+            raise UsageError(f"{option} and {name}: give only one of them")
 
 
 def _job(env: "Environment", request: ListedSweep, path_unit: str | None) -> _Job:
@@ -244,7 +244,6 @@ def _envelope(
     about: Point | None = None, at: "NDArray[np.float64] | None" = None,
 ) -> "Part | None":  # fmt: skip
     """Envelope of a path, if wanted; made first: what is wrong with it ends no long sweep."""
-    import hapticdb
     from hapticdb.ingest.files import ImportOptions
     from hapticdb.ingest.planning import check_names, planned
     from hapticdb.mesh import MeshFile

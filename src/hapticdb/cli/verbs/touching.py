@@ -120,14 +120,12 @@ def _touch_into(
     out: Path, shell: "PointShell", pieces: "Generator[TouchBatch, None, None]"
 ) -> None:
     """Write forces and contacts to a file, batch by batch."""
-    import numpy as np
-
     first = n_touching = 0
     with open_table(out, "--out") as write, closing(pieces):
         for batch in pieces:
             write(batch.columns(first))
             first += len(batch)
-            n_touching += int(np.count_nonzero(batch.n_contacts))
+            n_touching += int((batch.n_contacts > 0).sum())
     render.facts([
         ("shell", shell_text(shell)),
         ("poses", f"{first:,}: {n_touching:,} in contact"),

@@ -6,7 +6,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticdb.page.scene.facets import Blocks, Facets, block_facets, coarsened, sharpened
+from hapticdb.page.scene.facets import Facets, block_facets, coarsened, sharpened
 
 
 def facets_of(mesh: trimesh.Trimesh) -> Facets:
@@ -31,7 +31,7 @@ def test_sharpened_cylinder_rims_only() -> None:
 @given(st.integers(0, 2**32), st.integers(1, 60))
 def test_block_facets_volume_and_outer_sides(seed: int, n: int) -> None:
     voxels = np.unique(np.random.default_rng(seed).integers(0, 5, (n, 3)), axis=0)
-    shown = block_facets(Blocks(voxels, 1))
+    shown = block_facets(voxels, 1)
     sides = sum(
         not (np.abs(voxels - (voxel + step)).sum(axis=1) == 0).any()
         for voxel in voxels
@@ -47,7 +47,6 @@ def test_block_facets_volume_and_outer_sides(seed: int, n: int) -> None:
 @given(st.integers(0, 2**32), st.integers(1, 50))
 def test_coarsened_cubes_enclose_voxels(seed: int, most: int) -> None:
     voxels = np.unique(np.random.default_rng(seed).integers(0, 200, (300, 3)), axis=0)
-    blocks = coarsened(voxels, most)
-    held = {tuple(place) for place in blocks.places.tolist()}
-    assert len(blocks.places) <= most
-    assert {tuple(place) for place in (voxels // blocks.edge).tolist()} == held
+    places, edge = coarsened(voxels, most)
+    assert len(places) <= most
+    assert {*map(tuple, (voxels // edge).tolist())} == {*map(tuple, places.tolist())}

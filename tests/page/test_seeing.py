@@ -12,13 +12,13 @@ import pytest
 import hapticdb
 from hapticdb.errors import UsageError
 from hapticdb.kernels._sets import building
+from hapticdb.page.browser import put
 from hapticdb.page.colours import MARKED
 from hapticdb.page.connection import Visitor
 from hapticdb.page.panels.jobs import COMPILES, WAITS, PanelJob, Progress
 from hapticdb.page.panels.tree import PartTree
 from hapticdb.page.panels.viewing import ViewControls
 from hapticdb.page.scene.browser_scene import SHEER
-from hapticdb.page.widgets import put
 from hapticdb.units import length_text
 from page_scene import page_of, two_parts
 

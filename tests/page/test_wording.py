@@ -3,7 +3,7 @@
 import pytest
 
 from hapticdb.page.panels.sweeps import COLOURS
-from hapticdb.page.scene.names import assemblies_of, found_ids
+from hapticdb.page.panels.tree import assemblies_of, found_ids
 from hapticdb.page.wording import escaped, note_html, plain_name, rows_html, short_name
 from hapticdb.verdicts import WORST
 

@@ -1,31 +1,28 @@
 """Animation of removal paths: a standalone HTML page with viser's player."""
 
-import importlib.util
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import SceneNodeHandle, ViserServer
 
 from hapticdb.environment import Environment
-from hapticdb.errors import FileError, MissingExtraError, pip_line
+from hapticdb.errors import FileError
 from hapticdb.exact.sweep_report import names_of
 from hapticdb.extraction.extraction_results import Extraction
 from hapticdb.grid import corners_of
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.page import colours
 from hapticdb.page.drawing import put_at
+from hapticdb.page.page_process import new_server, stop
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened, sharpened
 from hapticdb.page.scene.surroundings import add_surroundings
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.poses import row_of_pose
 from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.store.base import Object
-
-if TYPE_CHECKING:
-    from viser import SceneNodeHandle, ViserServer
 
 Floats = NDArray[np.float64]
 
@@ -38,19 +35,8 @@ PAUSE = 0.8
 AROUND = 0.6
 """Margin of the surroundings, as a share of the longest edge of the paths' AABB."""
 
-
-class _Move(NamedTuple):
-    """A step of the animation: node of its parts, poses (n, 4, 4), and label."""
-
-    node: "SceneNodeHandle"
-    poses: Floats
-    words: "SceneNodeHandle"
-
-
-def check_view() -> None:
-    """Check for the extra `view`; MissingExtraError without it."""
-    if importlib.util.find_spec("viser") is None:
-        raise MissingExtraError(f"an animation needs more packages: {pip_line('view')}")
+_Move = tuple[SceneNodeHandle, Floats, SceneNodeHandle]
+"""A step of the animation: node of its parts, poses (n, 4, 4), and label."""
 
 
 def animate(
@@ -63,15 +49,12 @@ def animate(
 ) -> None:
     """Write an HTML page that plays removal paths one after another, in a loop.
 
-    The page needs no server. An existing file is replaced. Raises `MissingExtraError` without the
-    extra `view`, `FileError` if the file cannot be written.
+    The page needs no server. An existing file is replaced. Raises `FileError` if the file cannot be
+    written.
 
     steps : each with a path, in order of removal; exclude : ids of hidden objects, unless a step
     removes them; up : vertical axis 'x', 'y' or 'z', by default that of most of the objects' files.
     """
-    check_view()
-    from hapticdb.page.page_process import new_server, stop  # noqa: PLC0415 - the extra `view`
-
     server = new_server()
     try:
         page = _recorded(server, env, steps, {*exclude}, up)
@@ -84,7 +67,7 @@ def animate(
 
 
 def _recorded(
-    server: "ViserServer", env: Environment, steps: Sequence[Extraction], exclude: set[int],
+    server: ViserServer, env: Environment, steps: Sequence[Extraction], exclude: set[int],
     up: str | None,
 ) -> str:  # fmt: skip
     """HTML page of the scene with all steps."""
@@ -109,9 +92,7 @@ def _recorded(
     return _played(server, moves)
 
 
-def _move(
-    server: "ViserServer", number: int, found: Extraction, poses: Floats, top: Floats
-) -> _Move:
+def _move(server: ViserServer, number: int, found: Extraction, poses: Floats, top: Floats) -> _Move:
     """Add the parts of a step in a colour of their own, with a hidden label."""
     surface = found.shell.surface
     assert isinstance(surface, Surface)  # noqa: S101 - parts have a surface
@@ -125,24 +106,24 @@ def _move(
     # vertices are sent relative to their middle: the node's poses carry it
     from_middle = np.eye(4)
     from_middle[:3, 3] = middle
-    return _Move(node, poses @ from_middle, label)
+    return node, poses @ from_middle, label
 
 
-def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
+def _played(server: ViserServer, moves: Sequence[_Move]) -> str:
     recording = server.get_scene_serializer()
-    for move in moves:  # initial state of each loop; viser records changes only
-        put_at(move.node, row_of_pose(move.poses[-1]))
-        put_at(move.node, row_of_pose(move.poses[0]))
-        move.node.visible = False
-        move.node.visible = True
-    for move in moves:
-        move.words.visible = True
+    for node, poses, _ in moves:  # initial state of each loop; viser records changes only
+        put_at(node, row_of_pose(poses[-1]))
+        put_at(node, row_of_pose(poses[0]))
+        node.visible = False
+        node.visible = True
+    for node, poses, words in moves:
+        words.visible = True
         recording.insert_sleep(PAUSE)
-        for pose in move.poses:
-            put_at(move.node, row_of_pose(pose))
+        for pose in poses:
+            put_at(node, row_of_pose(pose))
             recording.insert_sleep(1.0 / PICTURES)
         recording.insert_sleep(PAUSE)
-        move.node.visible = move.words.visible = False
+        node.visible = words.visible = False
     recording.insert_sleep(1.0 / PICTURES)
     return str(recording.as_html())
 
@@ -175,14 +156,12 @@ def _standing(env: Environment, box: Floats, exclude: set[int]) -> list[Facets]:
         and (obj.bounds[1] > box[0] - reach).all()
         and (obj.bounds[0] < box[1] + reach).all()
     ]
-    shapes: dict[int, Facets] = {}
-    for obj, part in parts_of(env.store, near):
-        if part.is_cloud:
-            shapes[obj.id] = _of_voxels(env, obj)
-        else:
-            shapes[obj.id] = _of_triangles(part.triangles(obj.transform))
+    shapes = [
+        _of_voxels(env, obj) if part.is_cloud else _of_triangles(part.triangles(obj.transform))
+        for obj, part in parts_of(env.store, near)
+    ]
     kept, total = [], 0
-    for facets in sorted(shapes.values(), key=lambda one: len(one.faces)):
+    for facets in sorted(shapes, key=lambda one: len(one.faces)):
         total += len(facets.faces)
         if total <= 400_000:  # the largest objects are dropped
             kept.append(facets)
@@ -196,7 +175,7 @@ def _of_triangles(triangles: Floats) -> Facets:
 
 
 def _of_voxels(env: Environment, obj: Object) -> Facets:
-    blocks = block_facets(coarsened(env.voxels(obj.id), 20_000))
+    blocks = block_facets(*coarsened(env.voxels(obj.id), 20_000))
     corners = np.asarray(env.grid.origin) + env.grid.voxel_size * blocks.vertices
     return Facets(corners, blocks.faces)
 

@@ -5,10 +5,11 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import ClientHandle, TransformControlsEvent
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page import checks, colours
@@ -23,9 +24,6 @@ from hapticdb.poses import pose_of_row, row_of_pose
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.hosted import HostedSession
 from hapticdb.store.base import Object
-
-if TYPE_CHECKING:
-    from viser import ClientHandle, TransformControlsEvent
 
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
@@ -54,7 +52,7 @@ class Browser:
     record: Any
     """Tabs of `TabbedBrowser`, whose modules import this one."""
 
-    def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
+    def __init__(self, site: Site, client: ClientHandle, visitor: Visitor, number: int) -> None:
         self.site, self.client, self.visitor = site, client, visitor
         self.number = number
         self.colour = colours.of_tool(self.number)
@@ -137,7 +135,7 @@ class Browser:
         """Show an error without the server's paths and addresses."""
         self.notify("Not done", self.site.error_text(error))
 
-    async def _moved(self, event: "TransformControlsEvent") -> None:
+    async def _moved(self, event: TransformControlsEvent) -> None:
         """Move the hand; async, on viser's event loop, so that events stay in order."""
 
         def act(event: Event) -> None:
@@ -290,10 +288,6 @@ class Browser:
                 "Recording incomplete", f"{n_lost:,} frames were lost: the server was too busy"
             )
 
-    def matrix_of_hand(self) -> Floats:
-        """Pose (4, 4) of the hand, metres."""
-        return pose_of_row(self.hand[:3], self.hand[3:])
-
     def matrix_of_tool(self) -> Floats:
         """Pose (4, 4) of the tool, metres; of the hand without a session."""
         session = self._running
@@ -404,6 +398,11 @@ class Browser:
             session, self.session = self.session, None
             self._over += [] if session is None else [session]
         self._end_sessions()
+
+
+def put(widget: Any, value: object) -> None:  # noqa: ANN401 - viser's types hide the setter
+    """Set a widget's value; its callbacks receive an event with client None."""
+    widget.value = value
 
 
 def has_moved(pose: Floats, before: Floats, diagonal: float) -> bool:

@@ -36,7 +36,9 @@ class DatabaseThread:
 
         def work() -> None:
             try:
-                answer = job(self._opened())
+                if self._env is None:  # in this thread, the only one that may use it
+                    self._env = open_environment(self._url, read_only=self._read_only)
+                answer = job(self._env)
             except HapticDBError as error:
                 failed(error)
             else:
@@ -63,10 +65,3 @@ class DatabaseThread:
                 LOG.exception("a job of the page failed")
         if self._env is not None:
             self._env.close()
-
-    def _opened(self) -> Environment:
-        """The environment, opened on first use."""
-        if self._env is None:
-            # in this thread, the only one that may use it
-            self._env = open_environment(self._url, read_only=self._read_only)
-        return self._env

@@ -1,22 +1,18 @@
 """Nodes of one person's view, apart from the objects: hand, tool, arrows, contacts, marks."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from viser import (
+    ArrowsHandle,
+    ClientHandle,
+    MeshHandle,
+    SceneApi,
+    SceneNodeHandle,
+    TransformControlsHandle,
+)
 
 from hapticdb.page import colours
 from hapticdb.page.tools import PageTool
-
-if TYPE_CHECKING:
-    from viser import (
-        ArrowsHandle,
-        ClientHandle,
-        MeshHandle,
-        SceneApi,
-        SceneNodeHandle,
-        TransformControlsHandle,
-    )
 
 Floats = NDArray[np.float64]
 
@@ -29,8 +25,8 @@ CONTACT_SHARE = 0.004
 
 
 def add_tool(
-    scene: "SceneApi", name: str, tool: PageTool, colour: colours.Colour, opacity: float | None
-) -> "MeshHandle":
+    scene: SceneApi, name: str, tool: PageTool, colour: colours.Colour, opacity: float | None
+) -> MeshHandle:
     """Add a tool's surface to a scene; the pose of its handle is the tool's."""
     return scene.add_mesh_simple(
         name, tool.vertices, tool.faces, color=colour, opacity=opacity, side="double",
@@ -39,8 +35,8 @@ def add_tool(
 
 
 def add_arrow(
-    scene: "SceneApi", name: str, colour: colours.Colour, width: float, middle: Floats
-) -> "ArrowsHandle":
+    scene: SceneApi, name: str, colour: colours.Colour, width: float, middle: Floats
+) -> ArrowsHandle:
     """Add a hidden arrow with a head of radius `width`, metres, at `middle` (3,)."""
     return scene.add_arrows(
         name, np.zeros((1, 2, 3)), colour, shaft_radius=0.35 * width, head_radius=width,
@@ -49,8 +45,8 @@ def add_arrow(
 
 
 def add_marks(
-    scene: "SceneApi", name: str, places: Floats, words: str, size: float
-) -> "list[SceneNodeHandle]":
+    scene: SceneApi, name: str, places: Floats, words: str, size: float
+) -> list[SceneNodeHandle]:
     """Mark points (N, 3), metres, with a label at the first; returns the nodes."""
     return [
         scene.add_point_cloud(
@@ -61,7 +57,7 @@ def add_marks(
     ]  # fmt: skip
 
 
-def put_at(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
+def put_at(node: SceneNodeHandle, pose: NDArray[np.floating]) -> None:
     """Set a node's pose (7,): metres, unit quaternion, scalar first."""
     node.position = pose[:3]
     node.wxyz = pose[3:]
@@ -74,7 +70,7 @@ class HandDrawing:
     that AABB, origin of the points, since viser sends float32; cap : greatest force sent, N.
     """
 
-    def __init__(self, client: "ClientHandle", diagonal: float, middle: Floats, cap: float) -> None:
+    def __init__(self, client: ClientHandle, diagonal: float, middle: Floats, cap: float) -> None:
         self._client = client
         self._diagonal = diagonal
         self.middle = middle
@@ -144,7 +140,7 @@ class HandDrawing:
         """Points relative to `middle`."""
         return np.asarray(np.asarray(points) - self.middle, np.float32)
 
-    def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
+    def point(self, arrow: ArrowsHandle, start: Floats, force: Floats) -> None:
         """Show a force (3,), N, at a position by an arrow with its node at `middle`."""
         longest = 0.22 * self._diagonal  # at the force cap
         arrow_vector = force * (longest / self.cap)

@@ -202,10 +202,7 @@ class Edits:
 
         def work(env: Environment) -> Answer:
             # made in the database's thread: a store belongs to the thread that opened it
-            own = self._of.get(person)
-            if own is None:
-                own = self._of[person] = PersonsEdits(env)
-            return job(own)
+            return job(self._of.setdefault(person, PersonsEdits(env)))
 
         self._database.submit(work, then, refused)
 

@@ -5,18 +5,15 @@ import io
 import socket
 import time
 import warnings
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+
+import viser
 
 from hapticdb.page.connection import PageConnection, PageRequest, Visitor
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.session.attached import AttachedHost
 from hapticdb.session.processes.process import MessageSender, parent_is_gone
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from viser import ClientHandle, ViserServer
 
 POLL_EVERY = 0.2
 """Period of the check for the parent's end, seconds."""
@@ -41,23 +38,21 @@ def work(request: PageRequest, sender: MessageSender) -> None:
         stop(server)
 
 
-def stop(server: "ViserServer") -> None:
+def stop(server: viser.ViserServer) -> None:
     """Stop viser without its message on stdout."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
-def new_server() -> "ViserServer":
+def new_server() -> viser.ViserServer:
     """Start viser on a free port of the loopback interface."""
-    import viser  # noqa: PLC0415 - the extra `view`
-
     # a browser may disconnect at any time: no warning for messages in its queue
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box with its own address
         return viser.ViserServer("127.0.0.1", 0, verbose=False)
 
 
-def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
+def open_page(site: Site, visitor_of: Callable[[int], Visitor]) -> None:
     """Show scene and panels; `visitor_of` raises KeyError after a client's disconnect."""
     server = site.server
     server.gui.set_panel_label(site.title)
@@ -68,7 +63,7 @@ def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
     server.gui.main_panel.set_width(320)  # pixels: 29 % of a window of 1,100
     server.scene.world_axes.visible = False
 
-    def connect(client: "ClientHandle") -> None:
+    def connect(client: viser.ClientHandle) -> None:
         try:
             visitor = visitor_of(client.client_id)
         except KeyError:  # disconnected already
@@ -84,7 +79,7 @@ def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
         if client.client_id not in server.get_clients():  # disconnected meanwhile
             disconnect(client)
 
-    def disconnect(client: "ClientHandle") -> None:
+    def disconnect(client: viser.ClientHandle) -> None:
         site.workers.submit(site.leave, client.client_id)
 
     server.on_client_connect(connect)

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import ViserServer
 
 from hapticdb.errors import UsageError
 from hapticdb.machines.joint_path import checked_values, read_joints
@@ -24,9 +25,6 @@ from hapticdb.page.scene.surroundings import set_first_view
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text
 from hapticdb.session.attached import AttachedHost
-
-if TYPE_CHECKING:
-    from viser import ViserServer
 
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
@@ -80,7 +78,7 @@ class SceneFacts:
 class Site:
     """State shared by all browsers; viser's server, session host, arguments of the process."""
 
-    server: "ViserServer"
+    server: ViserServer
     host: AttachedHost
     request: PageRequest
     connection: PageConnection

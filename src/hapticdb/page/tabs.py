@@ -1,6 +1,8 @@
 """Browser with the tabs of the panel."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from viser import ClientHandle
 
 from hapticdb.page import checks
 from hapticdb.page.browser import Browser
@@ -14,14 +16,11 @@ from hapticdb.page.panels.touch import TouchPanel
 from hapticdb.page.panels.viewing import ViewControls
 from hapticdb.page.site import Site
 
-if TYPE_CHECKING:
-    from viser import ClientHandle
-
 
 class TabbedBrowser(Browser):
     """Browser with all tabs; parameters as for `Browser`."""
 
-    def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
+    def __init__(self, site: Site, client: ClientHandle, visitor: Visitor, number: int) -> None:
         super().__init__(site, client, visitor, number)
         gui = client.gui
         self._n_waiting = -1  # parts without a shape yet; -1: never counted

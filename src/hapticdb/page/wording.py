@@ -63,16 +63,6 @@ def escaped(text: str) -> str:
     return html.escape(plain_name(text), quote=True)
 
 
-def force_text(newtons: float) -> str:
-    """Force with two decimals: ``1.25 N``."""
-    return f"{newtons:.2f} N"
-
-
-def torque_text(newton_metres: float) -> str:
-    """Torque with three decimals: ``0.031 N m``."""
-    return f"{newton_metres:.3f} N m"
-
-
 def size_text(obj: Object) -> str:
     """Edges of an object's AABB, in metres or millimetres: ``1.2 m x 40 mm x 3 mm``."""
     return " × ".join(length_text(float(side)) for side in obj.bounds[1] - obj.bounds[0])  # noqa: RUF001 - the sign of sizes

@@ -1,8 +1,9 @@
 """Tab Clashes: groups of pairs, their display, acceptances and rules."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from viser import GuiApi, GuiEvent
 
 from hapticdb.clashes.clash_results import Clash, Clashes, Shown, rule_for
 from hapticdb.clashes.groups import Group, groups_of
@@ -12,16 +13,12 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
 from hapticdb.exact.separation import CONTACT
 from hapticdb.page import checks, colours
-from hapticdb.page.browser import LEAST_SHOWN, Browser
+from hapticdb.page.browser import LEAST_SHOWN, Browser, put
 from hapticdb.page.drawing import add_marks
 from hapticdb.page.panels.jobs import PanelJob, Progress
-from hapticdb.page.widgets import put
 from hapticdb.page.wording import note_html, rows_html, short_name
 from hapticdb.units import length_text
 from hapticdb.verdicts import REPORTED
-
-if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent
 
 ALL, OPEN = "all", "all but accepted, meant and gone"
 STATUSES = (OPEN, ALL, "new", "changed", "same", "gone", "accepted", "meant", "not looked at")
@@ -38,7 +35,7 @@ LONGEST_TEXT = 400
 class ClashPanel:
     """Search for clashes, list of groups, and, for editors, acceptances and rules."""
 
-    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: GuiApi) -> None:
         self._browser = browser
         self._found: Clashes | None = None
         self._groups: list[Group] = []
@@ -113,7 +110,7 @@ class ClashPanel:
         if self._found is not None:
             self._work.said.content = note_html("Parts have changed since: look again.")
 
-    def _filter(self, event: "GuiEvent[Any]") -> None:
+    def _filter(self, event: GuiEvent[Any]) -> None:
         if event.client is not None:
             self._fill()
 
@@ -143,7 +140,7 @@ class ClashPanel:
         put(self._list, NOTHING)
         self._what.content, self._group = "", None
 
-    def _pick(self, event: "GuiEvent[Any]") -> None:
+    def _pick(self, event: GuiEvent[Any]) -> None:
         if event.client is not None and event.target.value != NOTHING:
             label = checks.choice_of(event.target.value, tuple(self._lines), "a group")
             self._choose(self._lines[label], 0)
@@ -165,7 +162,7 @@ class ClashPanel:
         self._what.content = rows_html(rows + ([("Because", one.because)] if one.because else []))
         put(self._rule, rule_for(one))
 
-    def _see(self, event: "GuiEvent[Any]") -> None:
+    def _see(self, event: GuiEvent[Any]) -> None:
         step = checks.choice_of(event.target.value, SEE, "what to see")
         if step == "End":
             self._end()
@@ -204,7 +201,7 @@ class ClashPanel:
             node.remove()
         self._browser.scene.spotlight({})
 
-    def _accept_or_not(self, event: "GuiEvent[Any]") -> None:
+    def _accept_or_not(self, event: GuiEvent[Any]) -> None:
         word = checks.choice_of(event.target.value, ("Accept", "Take back"), "a step")
         because = checks.text_of(self._because.value, LONGEST_TEXT, "a reason").strip()
         if word == "Accept" and not because:

@@ -3,16 +3,14 @@
 import logging
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
+
+from viser import GuiApi
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels._sets import building
-from hapticdb.page.browser import Browser
-from hapticdb.page.widgets import put
+from hapticdb.page.browser import Browser, put
 from hapticdb.page.wording import note_html
-
-if TYPE_CHECKING:
-    from viser import GuiApi
 
 LOG = logging.getLogger("hapticdb.page")
 Progress = Callable[[int, int], None]
@@ -29,7 +27,7 @@ class PanelJob:
     what : name of the job; steps : plural of the steps in its progress.
     """
 
-    def __init__(self, browser: Browser, gui: "GuiApi", what: str, steps: str) -> None:
+    def __init__(self, browser: Browser, gui: GuiApi, what: str, steps: str) -> None:
         self._browser, self._what, self._steps = browser, what, steps
         self._is_running = False
         self._doing = ""  # words of the job's state; empty: its result is shown

@@ -1,10 +1,11 @@
 """Tab Sweep, a machine: its base on a gizmo, its joint path, and the sweep along it."""
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import GuiApi
 
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
@@ -14,17 +15,13 @@ from hapticdb.machines.joint_path import checked_values
 from hapticdb.machines.machine import Machine
 from hapticdb.machines.machine_sweep import sweep_machine
 from hapticdb.page import checks, colours
-from hapticdb.page.browser import Browser
+from hapticdb.page.browser import Browser, put
 from hapticdb.page.drawing import add_marks, put_at
 from hapticdb.page.panels.jobs import PanelJob, Progress
 from hapticdb.page.panels.sweeps import SECONDS, swept_html
 from hapticdb.page.site import TICKS
-from hapticdb.page.widgets import put
 from hapticdb.page.wording import note_html
 from hapticdb.poses import pose_of_row, row_of_pose
-
-if TYPE_CHECKING:
-    from viser import GuiApi
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +36,7 @@ class MachinePanel:
     gets the same numbers.
     """
 
-    def __init__(self, browser: Browser, gui: "GuiApi", machine: Machine, q: Floats) -> None:
+    def __init__(self, browser: Browser, gui: GuiApi, machine: Machine, q: Floats) -> None:
         self._browser, self._machine, self._q = browser, machine, q
         self._values = checked_values(machine, q)
         self._marks: list[Any] = []

@@ -3,21 +3,18 @@
 import threading
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import GuiApi, GuiEvent, TransformControlsEvent
 
 from hapticdb.page import checks
-from hapticdb.page.browser import Browser
+from hapticdb.page.browser import Browser, put
 from hapticdb.page.edits import PersonsEdits
-from hapticdb.page.widgets import put
 from hapticdb.page.wording import short_name
 from hapticdb.poses import pose_of_row
 from hapticdb.store.base import Object
-
-if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent, TransformControlsEvent
 
 
 @dataclass(eq=False)
@@ -45,7 +42,7 @@ class MoveControls:
     the follower's, and selections in viser's pool; one lock guards the gizmo.
     """
 
-    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: GuiApi) -> None:
         self._browser = browser
         self._lock = threading.RLock()
         self._part: _DraggedPart | None = None
@@ -104,16 +101,16 @@ class MoveControls:
                 self._browser.site.view.put_back(self._part.object.id)
             self._is_dragged = False
 
-    def _switch(self, event: "GuiEvent[Any]") -> None:
+    def _switch(self, event: GuiEvent[Any]) -> None:
         if checks.flag_of(event.target.value, "moving") and len(self._browser.chosen) != 1:
             put(self._moves, value=False)
             self._browser.only_chosen()
         self.follow()
 
-    async def _dragged(self, part: _DraggedPart, event: "TransformControlsEvent") -> None:
+    async def _dragged(self, part: _DraggedPart, event: TransformControlsEvent) -> None:
         """Preview a drag, and write the placement at its end, if the browser is still connected."""
 
-        def act(event: "TransformControlsEvent") -> None:
+        def act(event: TransformControlsEvent) -> None:
             row = checks.row_of(event.target.position, event.target.wxyz)
             pose = pose_of_row(row[:3], row[3:])
             with self._lock:
@@ -169,7 +166,7 @@ class MoveControls:
         assert browser.site.edits is not None  # noqa: S101 - else the box is not there
         browser.site.edits.submit(browser.client.client_id, move, written, refused)
 
-    def _take_out(self, event: "GuiEvent[Any]") -> None:
+    def _take_out(self, event: GuiEvent[Any]) -> None:
         word = checks.choice_of(event.target.value, ("Take out", "Put back"), "a step")
         if word == "Put back":
             self._browser.edit(lambda own: own.put_back())

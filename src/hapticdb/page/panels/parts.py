@@ -1,10 +1,11 @@
 """Tab Parts: tree, properties, visibility, distances, and moves of parts."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import GuiApi, GuiEvent
 
 from hapticdb.batches.exact import MET, Distance
 from hapticdb.environment import Environment
@@ -19,9 +20,6 @@ from hapticdb.page.wording import note_html, rows_html, short_name, size_text
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.units import length_text
 
-if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent
-
 Floats = NDArray[np.float64]
 
 MOST_VOXELS = 60_000
@@ -33,7 +31,7 @@ CHOOSE = "Click a part, or press its name. Ctrl and a click add one."
 class PartsPanel:
     """Selection of parts; their visibility, collision and distances in this browser."""
 
-    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: GuiApi) -> None:
         self._browser = browser
         self._client = browser.client
         self._ends: list[Floats] = []
@@ -112,7 +110,7 @@ class PartsPanel:
             said = rows_html((("Parts", f"{len(chosen):,}"), ("Voxels", f"{total:,}")))
         self._what.content = said
 
-    def _show_or_hide(self, event: "GuiEvent[Any]") -> None:
+    def _show_or_hide(self, event: GuiEvent[Any]) -> None:
         browser = self._browser
         word = checks.choice_of(event.target.value, ACTS, "what to show")
         scene, chosen = browser.scene, browser.chosen
@@ -135,7 +133,7 @@ class PartsPanel:
         browser.filter_changed()
         self._tree.show()
 
-    def _show_voxels(self, event: "GuiEvent[Any]") -> None:
+    def _show_voxels(self, event: GuiEvent[Any]) -> None:
         if checks.flag_of(event.target.value, "voxels"):
             self._browser.only_chosen()
             self._draw_voxels()
@@ -217,7 +215,7 @@ class PartsPanel:
 
         self._work.begin(job, show)
 
-    def _start_measuring(self, event: "GuiEvent[Any]") -> None:
+    def _start_measuring(self, event: GuiEvent[Any]) -> None:
         checks.flag_of(event.target.value, "measuring")
         self._ends = []
         self._browser.scene.clear_measure()

@@ -2,22 +2,19 @@
 
 import time
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import GuiApi, GuiEvent
 
 from hapticdb.errors import FileError, UsageError
 from hapticdb.page import checks, colours
-from hapticdb.page.browser import Browser
+from hapticdb.page.browser import Browser, put
 from hapticdb.page.drawing import add_arrow, put_at
 from hapticdb.page.site import checked_file
-from hapticdb.page.widgets import put
-from hapticdb.page.wording import force_text, note_html, rows_html
+from hapticdb.page.wording import note_html, rows_html
 from hapticdb.recording.file import Recording
-
-if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent
 
 Floats = NDArray[np.float64]
 
@@ -45,7 +42,7 @@ class Replay(NamedTuple):
 class RecordPanel:
     """Recording of this browser's session into the operator's folder, and replay from it."""
 
-    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: GuiApi) -> None:
         self._browser = browser
         self._replay: Replay | None = None
         self._drawn: list[Any] = []
@@ -106,7 +103,7 @@ class RecordPanel:
         self._state.content = note_html(said)
         self._list.options = (NOTHING, *self._names())
 
-    def _choose(self, event: "GuiEvent[Any]") -> None:
+    def _choose(self, event: GuiEvent[Any]) -> None:
         name = checks.choice_of(event.target.value, (NOTHING, *self._names()), "a recording")
         for node in self._drawn:
             node.remove()
@@ -146,7 +143,7 @@ class RecordPanel:
             )  # fmt: skip
             self._drawn.append(way)
 
-    def _slide(self, event: "GuiEvent[Any]") -> None:
+    def _slide(self, event: GuiEvent[Any]) -> None:
         if event.client is None or self._replay is None:
             return
         at = checks.number_of(event.target.value, 0.0, self._replay.end + 0.01, "a time")
@@ -190,5 +187,5 @@ class RecordPanel:
         drawing.point(arrow, tool[:3], wrench[:3])
         force = float(np.linalg.norm(wrench[:3]))
         self._said.content = rows_html(
-            (("Time", f"{replay.times[n]:.2f} s"), ("Force", force_text(force)))
+            (("Time", f"{replay.times[n]:.2f} s"), ("Force", f"{force:.2f} N"))
         )

@@ -1,9 +1,10 @@
 """Tab Sweep: verdict, hits and least distance of a tool or a part along a path."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import GuiApi
 
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
@@ -16,10 +17,7 @@ from hapticdb.page.drawing import add_marks, add_tool, put_at
 from hapticdb.page.panels.jobs import PanelJob, Progress
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.poses import row_of_pose
-
-if TYPE_CHECKING:
-    from viser import GuiApi
+from hapticdb.poses import pose_of_row, row_of_pose
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +37,7 @@ DIRECTIONS = {
 class SweepPanel:
     """Sweeps of this browser's tool or chosen part, and display of their results."""
 
-    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: GuiApi) -> None:
         self._browser = browser
         self._drawn: list[Any] = []
         guard = browser.guarded
@@ -68,7 +66,8 @@ class SweepPanel:
         part = browser.dragged_part if is_part else None
         if is_part and part is None:
             part = browser.only_chosen().id
-        site, tool, hand = browser.site, browser.tool, browser.matrix_of_hand()
+        site, tool = browser.site, browser.tool
+        hand = pose_of_row(browser.hand[:3], browser.hand[3:])
         first = browser.matrix_of_tool() if part is None else np.eye(4)
         is_seated, ids = part is not None, [] if part is None else [part]
         exclude = {*browser.excluded_ids, *ids}

@@ -1,29 +1,18 @@
 """Tab Touch: wrench, touched objects and force plot; tool, stiffness and scale."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import GuiApi, GuiEvent, GuiUplotHandle
+from viser.uplot import Axis, Legend, Scale, Series
 
 from hapticdb.page import checks, colours
-from hapticdb.page.browser import Browser
-from hapticdb.page.widgets import put
-from hapticdb.page.wording import (
-    MOST_SAID,
-    escaped,
-    force_text,
-    note_html,
-    short_name,
-    swatch,
-    torque_text,
-)
+from hapticdb.page.browser import Browser, put
+from hapticdb.page.wording import MOST_SAID, escaped, note_html, short_name, swatch
 from hapticdb.recording.frame import State
 from hapticdb.session.coupling import limit_text
 from hapticdb.store.base import Object
-
-if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent, GuiUplotHandle
-    from viser.uplot import Scale
 
 SHOWN_EVERY = 0.2
 """Period of numbers and plot, seconds."""
@@ -42,7 +31,7 @@ SCALES = (0.05, 20.0)
 class TouchPanel:
     """Readings of the session's newest frame, and controls of tool, stiffness and scale."""
 
-    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: GuiApi) -> None:
         self._browser = browser
         self._shown_at = 0.0
         may_touch = browser.visitor.may("toucher")
@@ -54,7 +43,7 @@ class TouchPanel:
         if may_touch:
             self._add_controls(gui)
 
-    def _add_controls(self, gui: "GuiApi") -> None:
+    def _add_controls(self, gui: GuiApi) -> None:
         browser = self._browser
         self._names = [tool.name for tool in browser.site.tools]
         self._tool = gui.add_dropdown("Tool", self._names, initial_value=browser.tool.name)
@@ -82,7 +71,7 @@ class TouchPanel:
             )  # fmt: skip
             scale.on_update(browser.guarded("toucher", self._rescale))
 
-    def _choose_tool(self, event: "GuiEvent[Any]") -> None:
+    def _choose_tool(self, event: GuiEvent[Any]) -> None:
         browser = self._browser
         is_held = event.target.value == PART and not self._is_of_the_list
         if event.client is None or is_held:  # set by the page, or unchanged
@@ -96,7 +85,7 @@ class TouchPanel:
         browser.put_back()
         browser.use_tool(browser.tool)
 
-    def _type_place(self, event: "GuiEvent[Any]") -> None:
+    def _type_place(self, event: GuiEvent[Any]) -> None:
         if event.client is None:  # set by the page
             return
         browser = self._browser
@@ -106,12 +95,12 @@ class TouchPanel:
         browser.move_hand(checks.row_of(position, browser.hand[3:]))
         browser.drawing.gizmo.position = position
 
-    def _stiffen(self, event: "GuiEvent[Any]") -> None:
+    def _stiffen(self, event: GuiEvent[Any]) -> None:
         self._browser.set_stiffness(
             checks.number_of(event.target.value, SOFTEST, STIFFEST, "a stiffness")
         )
 
-    def _rescale(self, event: "GuiEvent[Any]") -> None:
+    def _rescale(self, event: GuiEvent[Any]) -> None:
         scale = checks.number_of(event.target.value, *self._scales, "a scale")
         if scale != self._browser.scale:
             self._browser.scale = scale
@@ -192,9 +181,9 @@ class TouchPanel:
             f"{escaped(who)}</div>"
             '<div style="display:flex;gap:24px;margin:4px 0">'
             f'<div><div style="{small}"><span>Force</span>{limit}</div>'
-            f'<div style="{big}">{force_text(force)}</div></div>'
+            f'<div style="{big}">{force:.2f} N</div></div>'
             f'<div><div style="{small}">Torque</div>'
-            f'<div style="{big}">{torque_text(torque)}</div></div></div>'
+            f'<div style="{big}">{torque:.3f} N m</div></div></div>'
             '<div style="font-size:0.82em;min-height:3.2em">'
             f"{names}{said}</div></div>"
         )
@@ -221,10 +210,8 @@ def _scales(top: float) -> "dict[str, Scale]":
     }
 
 
-def _plot(gui: "GuiApi", *, is_seen: bool) -> "GuiUplotHandle":
+def _plot(gui: GuiApi, *, is_seen: bool) -> "GuiUplotHandle":
     """Add the plot of force and torque, each on an axis of its own."""
-    from viser.uplot import Axis, Legend, Series  # noqa: PLC0415 - the extra `view`
-
     return gui.add_uplot(
         (np.array([-SECONDS, 0.0]), np.zeros(2), np.zeros(2)),
         (

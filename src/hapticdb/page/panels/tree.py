@@ -1,17 +1,15 @@
 """Tree of sub-assemblies with a button for each part, or the hits of a search."""
 
 import threading
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from viser import GuiApi, GuiEvent
 
 from hapticdb.errors import UsageError
 from hapticdb.page import checks
 from hapticdb.page.browser import Browser
-from hapticdb.page.scene.names import assemblies_of, found_ids
 from hapticdb.page.wording import note_html, plain_name, short_name
-
-if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent
 
 MOST_FOLDERS, MOST_BUTTONS = 60, 400
 """Greatest numbers of sub-assemblies and of parts in the tree, the outer ones first."""
@@ -21,6 +19,7 @@ CHOSEN, HIDDEN = "✓ ", "○ "
 """Marks before the names of chosen and of hidden parts."""
 
 Ids = tuple[int, ...]
+Key = TypeVar("Key", int, str)
 
 
 class PartTree:
@@ -31,7 +30,7 @@ class PartTree:
     """
 
     def __init__(
-        self, browser: Browser, gui: "GuiApi", toggle: Callable[[Sequence[int]], None]
+        self, browser: Browser, gui: GuiApi, toggle: Callable[[Sequence[int]], None]
     ) -> None:
         self._browser, self._gui, self._toggle = browser, gui, toggle
         self._lock = threading.RLock()
@@ -108,7 +107,7 @@ class PartTree:
         group.on_click(self._browser.guarded("viewer", lambda event: self._press(event, labels)))
         self._groups.append((group, labels))
 
-    def _press(self, event: "GuiEvent[Any]", labels: dict[str, Ids]) -> None:
+    def _press(self, event: GuiEvent[Any], labels: dict[str, Ids]) -> None:
         label = checks.text_of(event.target.value, 2048, "a part")
         if label not in labels:
             # with its marks; without them first, since a name may begin with one
@@ -117,7 +116,7 @@ class PartTree:
             raise UsageError("this part is there no longer: press another")
         self._toggle(labels[label])
 
-    def _searched(self, event: "GuiEvent[Any]") -> None:
+    def _searched(self, event: GuiEvent[Any]) -> None:
         checks.text_of(event.target.value, LONGEST_SEARCH, "a search")
         self.show()
 
@@ -125,3 +124,32 @@ class PartTree:
 def _marked(name: str, ids: Ids, chosen: set[int], hidden: set[int]) -> str:
     marks = CHOSEN if chosen.issuperset(ids) else ""
     return plain_name(marks + (HIDDEN if hidden.issuperset(ids) else "") + name)
+
+
+def assemblies_of(names: Mapping[int, str]) -> dict[str, list[int]]:
+    """Ids of the objects below each sub-assembly, by its path; outer ones first."""
+    found: dict[str, list[int]] = {}
+    for object_id, name in sorted(names.items(), key=lambda item: (item[1], item[0])):
+        end = name.find("/", 1)
+        while end > 0:
+            found.setdefault(name[:end], []).append(object_id)
+            end = name.find("/", end + 1)
+    return found
+
+
+def found_ids(names: Mapping[Key, str], text: str) -> list[Key]:
+    """Keys of the names with each word of a text, in any order and case.
+
+    First those with the text at the start of their last element, then those with a word of it in
+    their last element, then the rest; by name within each.
+    """
+    words = text.casefold().split()
+    whole = " ".join(words)
+    found = []
+    for object_id, given in names.items():
+        name = given.casefold()
+        if words and all(word in name for word in words):
+            last = name.rpartition("/")[2]
+            rank = 0 if last.startswith(whole) else 1 if any(w in last for w in words) else 2
+            found.append((rank, name, object_id))
+    return [object_id for _, _, object_id in sorted(found)]

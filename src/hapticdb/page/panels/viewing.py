@@ -1,19 +1,17 @@
 """Folder View: standard views, what to fit, a section, and a link to what is seen."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import GuiApi, GuiEvent
 
 from hapticdb.errors import UsageError
 from hapticdb.grid import corners_of
 from hapticdb.page import checks
 from hapticdb.page.browser import LEAST_SHOWN, Browser
 from hapticdb.page.scene.surroundings import FIELD_OF_VIEW
-
-if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent
 
 Floats = NDArray[np.float64]
 FITS = ("Chosen", "Tool", "All")
@@ -35,7 +33,7 @@ def sides_of(up: int) -> dict[str, Floats]:
 class ViewControls:
     """Camera of one browser. The section is viser's near plane, at a share of the scene's depth."""
 
-    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: GuiApi) -> None:
         self._browser, self._camera = browser, browser.client.camera
         self._sides = sides_of(browser.site.view.up)
         self._corners = corners_of(browser.site.facts.bounds)
@@ -55,13 +53,13 @@ class ViewControls:
             self._link = gui.add_html("")
         self._camera.on_update(guard("viewer", self._cut))
 
-    def _look_from(self, event: "GuiEvent[Any]") -> None:
+    def _look_from(self, event: GuiEvent[Any]) -> None:
         side = self._sides[checks.choice_of(event.target.value, self._sides, "a side")]
         target = self._camera.look_at
         away = float(np.linalg.norm(self._camera.position - target))
         self._browser.scene.fly_to(target, away * math.sin(FIELD_OF_VIEW / 2), side)
 
-    def _fit(self, event: "GuiEvent[Any]") -> None:
+    def _fit(self, event: GuiEvent[Any]) -> None:
         browser, word = self._browser, checks.choice_of(event.target.value, FITS, "what to fit")
         if word == "Tool":
             radius = max(2.0 * browser.tool.radius, LEAST_SHOWN * browser.site.facts.diagonal)

@@ -4,10 +4,10 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from viser import ClientHandle
 
 from hapticdb.page.colours import FADED, MARKED, Colour, Rgba
 from hapticdb.page.scene.contents import Contents
@@ -15,9 +15,6 @@ from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.nodes import Member
 from hapticdb.page.scene.picking import RayHit
 from hapticdb.page.scene.surroundings import FIELD_OF_VIEW, add_shadow
-
-if TYPE_CHECKING:
-    from viser import ClientHandle
 
 Floats = NDArray[np.float64]
 FLIGHT_STEPS = 18
@@ -60,7 +57,7 @@ class BrowserScene:
     of removed objects.
     """
 
-    def __init__(self, client: "ClientHandle", contents: Contents, up: int, ground: float) -> None:
+    def __init__(self, client: ClientHandle, contents: Contents, up: int, ground: float) -> None:
         self._client, self._contents = client, contents
         self._up, self._ground = up, ground
         self._key = client.client_id

@@ -7,17 +7,15 @@ name.
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from viser import BatchedMeshHandle, PointCloudHandle, SceneApi, SceneNodeHandle
 
 from hapticdb.page.colours import Colour, sent
 from hapticdb.page.scene.facets import Facets
 from hapticdb.page.scene.shapes import Dots
-
-if TYPE_CHECKING:
-    from viser import BatchedMeshHandle, PointCloudHandle, SceneApi, SceneNodeHandle
 
 COARSER = ((14.0, 0.4), (45.0, 0.1))
 """Levels of detail: distance of the eye, in radii of the shape, and share of the triangles. At 14
@@ -36,12 +34,6 @@ class Geometry:
     make: Callable[[], Facets]
     radius: float
     opacity: float | None = None
-
-    def coarser(self, n_vertices: int) -> tuple[tuple[float, float], ...] | str:
-        """Levels of detail for viser: distances, metres, and shares of triangles."""
-        if n_vertices < 64:
-            return "off"
-        return tuple((ratio * self.radius, share) for ratio, share in COARSER)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +88,7 @@ class PointDrawing:
 class Audience:
     """Scene nodes of all browsers (`server.scene`) or of one (`client.scene`)."""
 
-    def __init__(self, scene: "SceneApi") -> None:
+    def __init__(self, scene: SceneApi) -> None:
         self._scene = scene
         self._meshes: dict[str, tuple[Hashable, BatchedMeshHandle | PointCloudHandle]] = {}
         self._blanks: dict[str, SceneNodeHandle] = {}
@@ -133,7 +125,7 @@ class Audience:
 
     def _added(
         self, name: str, drawing: Drawing | PointDrawing
-    ) -> "BatchedMeshHandle | PointCloudHandle":
+    ) -> BatchedMeshHandle | PointCloudHandle:
         if isinstance(drawing, PointDrawing):
             points, colours, size = drawing.dots
             return self._scene.add_point_cloud(
@@ -143,10 +135,11 @@ class Audience:
             )  # fmt: skip
         vertices, faces = drawing.geometry.make()
         middle = drawing.positions.mean(axis=0)  # viser sends float32
+        levels = tuple((ratio * drawing.geometry.radius, share) for ratio, share in COARSER)
         return self._scene.add_batched_meshes_simple(
             name, vertices, faces, drawing.wxyzs, drawing.positions - middle,
             batched_scales=drawing.sizes, batched_colors=sent(drawing.colours),
-            lod=drawing.geometry.coarser(len(vertices)),  # type: ignore[arg-type]
+            lod="off" if len(vertices) < 64 else levels,
             opacity=drawing.geometry.opacity, side="double", cast_shadow=False,
             receive_shadow=False, position=middle,
         )  # fmt: skip

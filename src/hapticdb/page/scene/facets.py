@@ -113,28 +113,20 @@ def _quads(corners: NDArray[np.float64]) -> Facets:
     return Facets(corners.reshape(-1, 3), faces.reshape(-1, 3))
 
 
-class Blocks(NamedTuple):
-    """Cubes of equal size: integer positions (n, 3), in cubes, and edge, in voxels."""
+def coarsened(voxels: NDArray[np.int64], most: int) -> tuple[NDArray[np.int64], int]:
+    """At most `most` cubes that cover voxels (n, 3): places (n, 3), in cubes, and edge, in voxels.
 
-    places: NDArray[np.int64]
-    edge: int
-
-
-def coarsened(voxels: NDArray[np.int64], most: int) -> Blocks:
-    """At most `most` cubes that cover voxels (n, 3); their edge is a power of two.
-
-    Positions are relative to the grid's origin and span less than 2^20 on each axis, so that three
-    fit in one integer.
+    The edge is a power of two. Positions are relative to the grid's origin and span less than 2^20
+    on each axis, so that three fit in one integer.
     """
     places, edge = voxels, 1
     while len(places) > most or np.ptp(places, axis=0).max(initial=0) >= 1 << 20:
         places, edge = np.unique(places >> 1, axis=0), 2 * edge
-    return Blocks(places, edge)
+    return places, edge
 
 
-def block_facets(blocks: Blocks) -> Facets:
-    """Exposed sides of cubes, in voxels from the grid's origin."""
-    places = blocks.places
+def block_facets(places: NDArray[np.int64], edge: int) -> Facets:
+    """Exposed sides of cubes, in voxels from the grid's origin; parameters as of `coarsened`."""
     # a margin of one cube: neighbours beyond the border have keys, too
     low = places.min(axis=0) - 1
     shape = places.max(axis=0) - low + 2
@@ -148,5 +140,5 @@ def block_facets(blocks: Blocks) -> Facets:
             wanted = np.ravel_multi_index(beside.T, shape)
             at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
             bare = places[keys[at] != wanted]
-            sides.append((bare[:, None, :] + 0.5 + _CUBE[_SIDES[2 * axis + side]]) * blocks.edge)
+            sides.append((bare[:, None, :] + 0.5 + _CUBE[_SIDES[2 * axis + side]]) * edge)
     return _quads(np.concatenate(sides))

@@ -45,20 +45,16 @@ class Targets:
             self._boxes = np.array([one.box for one in self._members.values()]).reshape(-1, 2, 3)
         enters, leaves = _slabs(self._boxes, start, ray)
         candidates = np.flatnonzero((enters <= leaves) & (leaves >= 0))
-        nearest: tuple[float, int] | None = None
+        nearest, hit = np.inf, None
         for row in candidates[np.argsort(enters[candidates])].tolist():
-            if nearest is not None and enters[row] > nearest[0]:
+            if enters[row] > nearest:
                 break
-            object_id = ids[row]
-            if not sees(object_id):
+            if not sees(ids[row]):
                 continue
-            found = _hit_distance(self._members[object_id], start, ray, float(enters[row]))
-            if found is not None and (nearest is None or found < nearest[0]):
-                nearest = (found, object_id)
-        if nearest is None:
-            return None
-        distance, object_id = nearest
-        return RayHit(object_id, start + distance * ray, distance)
+            found = _hit_distance(self._members[ids[row]], start, ray, float(enters[row]))
+            if found is not None and found < nearest:
+                nearest, hit = found, ids[row]
+        return None if hit is None else RayHit(hit, start + nearest * ray, nearest)
 
 
 def _slabs(

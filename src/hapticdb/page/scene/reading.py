@@ -115,7 +115,7 @@ def _cloud(obj: Object, part: Part) -> PartShape:
         points, colours = points[some], None if colours is None else colours[some]
     low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
     steps = np.unique(np.floor((points - low) * (CUBES / size)).astype(np.int64), axis=0)
-    vertices, faces = block_facets(coarsened(steps, MOST_BLOCKS))
+    vertices, faces = block_facets(*coarsened(steps, MOST_BLOCKS))
     shape = PartShape(Facets(vertices * (size / CUBES) + low, faces))
     edges = np.sort(np.ptp(points, axis=0))
     shape.dots = Dots(

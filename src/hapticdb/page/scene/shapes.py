@@ -6,6 +6,9 @@ from itertools import count
 from typing import NamedTuple, cast
 
 import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore import EmbreeDevice
+from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from hapticdb.page.colours import Rgba, few
@@ -101,9 +104,6 @@ class PartShape:
     @cached_property
     def _embree(self) -> tuple[object, float]:
         """Embree's scene of the triangles, and its scale, 1/m."""
-        from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415 - extra `view`
-        from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415 - likewise
-
         scale = _EMBREE_SIZE / max(self.radius, 1e-12)
         scene = EmbreeScene(_device())
         vertices = (self.facets.vertices * scale).astype(np.float32)
@@ -155,6 +155,4 @@ def draw_each(shapes: Iterable[PartShape]) -> None:
 @cache
 def _device() -> object:
     """Embree's only device: it crashes after thousands of them."""
-    from embreex.rtcore import EmbreeDevice  # noqa: PLC0415 - extra `view`
-
     return EmbreeDevice()

@@ -1,15 +1,13 @@
 """Surroundings of the objects: vertical axis, ground, light, background, first view."""
 
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from viser import SceneApi, ViserServer
 
 from hapticdb.poses import quaternion_of
-
-if TYPE_CHECKING:
-    from viser import SceneApi, ViserServer
 
 Plane = Literal["yz", "zx", "xy"]
 PLANES: tuple[Plane, ...] = get_args(Plane)
@@ -45,7 +43,7 @@ def framing(box: NDArray[np.float64], up: int, reach: float = 0.0) -> View:
     return View(center + toward * radius / np.sin(FIELD_OF_VIEW / 2), center)
 
 
-def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
+def add_surroundings(server: ViserServer, box: NDArray[np.float64], up: int) -> None:
     """Add light, background, ground and first view for objects in an AABB (2, 3), metres."""
     scene = server.scene
     scene.set_up_direction(tuple(np.eye(3)[up]))
@@ -59,7 +57,7 @@ def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -
     set_first_view(server, box, up, 0.0)
 
 
-def set_first_view(server: "ViserServer", box: NDArray[np.float64], up: int, reach: float) -> None:
+def set_first_view(server: ViserServer, box: NDArray[np.float64], up: int, reach: float) -> None:
     """Set the initial camera of browsers to the view of `framing`."""
     view, camera = framing(box, up, reach), server.initial_camera
     radius = float(np.linalg.norm(view.position - view.look_at)) * np.sin(FIELD_OF_VIEW / 2)
@@ -70,7 +68,7 @@ def set_first_view(server: "ViserServer", box: NDArray[np.float64], up: int, rea
     camera.position = tuple(view.position)
 
 
-def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
+def _set_ground(scene: SceneApi, box: NDArray[np.float64], up: int) -> None:
     """Lines below the objects, a power of ten metres apart."""
     radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
     spacing = 10.0 ** np.floor(np.log10(radius / 2))
@@ -87,7 +85,7 @@ def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
     )  # fmt: skip
 
 
-def add_shadow(scene: "SceneApi", boxes: NDArray[np.float64], up: int, ground: float) -> None:
+def add_shadow(scene: SceneApi, boxes: NDArray[np.float64], up: int, ground: float) -> None:
     """Replace the soft shadow by that of AABBs (n, 2, 3), metres: an image, free to render.
 
     ground : its height, metres.

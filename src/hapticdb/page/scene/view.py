@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from threading import Event
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from viser import ViserServer
 
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
@@ -21,9 +21,6 @@ from hapticdb.page.scene.surroundings import add_surroundings
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 
-if TYPE_CHECKING:
-    from viser import ViserServer
-
 
 class SceneView:
     """Display of an environment's objects in all browsers of a viser server.
@@ -35,7 +32,7 @@ class SceneView:
     HapticDBError if the environment cannot be opened or read.
     """
 
-    def __init__(self, server: "ViserServer", url: str) -> None:
+    def __init__(self, server: ViserServer, url: str) -> None:
         self._server, self._url = server, url
         self.contents = Contents(Audience(server.scene))
         """Objects, nodes, and the view of each browser."""
@@ -104,18 +101,15 @@ class SceneView:
                     anew.append(obj)
             self.contents.add(anew)
             self.revision = revision
-            self._add_surroundings()
+            objects, box = self.contents.records.values(), self.contents.box()
+            if not self._is_surrounded and box is not None:
+                self._is_surrounded = True
+                self.up = up_axis(objects)
+                add_surroundings(self._server, box, self.up)
         if anew:
             self._reader.read(anew)
         if self.on_edit is not None:
             self.on_edit()
-
-    def _add_surroundings(self) -> None:
-        objects, box = self.contents.records.values(), self.contents.box()
-        if not self._is_surrounded and box is not None:
-            self._is_surrounded = True
-            self.up = up_axis(objects)
-            add_surroundings(self._server, box, self.up)
 
     def _show_shapes(self, found: Sequence[ShapedObject]) -> None:
         with self._server.atomic():
@@ -137,6 +131,6 @@ class SceneView:
 
 def _blocks(obj: Object, voxels: NDArray[np.int64], grid: Grid) -> ShapedObject:
     """Shape of an object's voxels, as blocks in the world frame."""
-    vertices, faces = block_facets(coarsened(voxels, MOST_BLOCKS))
+    vertices, faces = block_facets(*coarsened(voxels, MOST_BLOCKS))
     shape = PartShape(Facets(vertices * grid.voxel_size + np.array(grid.origin), faces))
     return obj, shape, centred(np.eye(4), shape)

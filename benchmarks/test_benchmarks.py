@@ -84,7 +84,7 @@ def test_measure_batch_peers_agree_far_from_parts(tmp_path: Path) -> None:
     for cell in found["cells"]:
         if (cell["situation"], cell["question"]) == ("free", "touch"):
             assert {side["agree"] for side in cell["sides"].values()} == {1.0}
-            assert len(cell["sides"]) == 8 - len(missing)
+            assert len(cell["sides"]) == 7 - len(missing)
 
 
 def test_removal_paths_spark_plug_keeps_proved_gap(tmp_path: Path) -> None:

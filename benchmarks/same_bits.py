@@ -77,21 +77,12 @@ def places(folder: Path, *, is_quick: bool) -> Iterator[tuple[str, str, Layout]]
             yield f"postgresql{found.major}", server.conninfo(), "brick"
 
 
-def chosen_poses(
-    env: hapticdb.Environment, shell: hapticdb.PointShell, path: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
-    """Poses (count, 4, 4): with a point of the shell near a voxel; a tenth along, or anywhere."""
-    rng, edge = np.random.default_rng(13), env.grid.edge
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = Rotation.random(count, random_state=13).as_matrix()
-    objects = env.objects()
-    drawn = [objects[n].id for n in rng.integers(len(objects), size=20)]
-    centers = np.concatenate([env.grid.centers(env.voxels(one)) for one in drawn])
-    poses[:, :3, 3] = rng.choice(centers, count) + rng.normal(size=(count, 3)) * env.grid.voxel_size
-    poses[:, :3, 3] -= np.einsum("nij,nj->ni", poses[:, :3, :3], rng.choice(shell.points, count))
-    anywhere = rng.uniform(-0.1, 1.1, (len(poses[::10]), 3))
-    poses[::10, :3, 3] = np.array(env.grid.origin) + edge * anywhere
-    poses[1::10] = path[: len(poses[1::10])]
+def chosen_poses(path: NDArray[np.float64], count: int, voxel: float) -> NDArray[np.float64]:
+    """Poses (count, 4, 4) around a path over surfaces, shifted by voxels; half are turned."""
+    rng = np.random.default_rng(13)
+    poses = rng.choice(path, count)
+    poses[:, :3, 3] += rng.normal(size=(count, 3)) * 3.0 * voxel
+    poses[::2, :3, :3] = Rotation.random(len(poses[::2]), random_state=13).as_matrix()
     return poses
 
 
@@ -149,7 +140,7 @@ def digests_of(folder: Path, first: Path, *, is_quick: bool, count: int) -> Dige
         hand, recording = folder / "hand.csv", first / f"{name}.rec"
         hapticdb.write_poses(hand, slide[HAND])
         with hapticdb.open(url, read_only=True) as env:
-            poses = chosen_poses(env, shell, slide, count)
+            poses = chosen_poses(slide, count, env.grid.voxel_size)
             digests.add(f"{name}/shell", "", shell.points, shell.normals, shell.center, poses)
             stored(digests, name, env, url, layout)
             touched(digests, name, env, shell, poses)

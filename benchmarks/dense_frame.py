@@ -9,7 +9,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS3, INT, INTS, INTS32, WORDS32_2, entry, leaf, record_of
+from hapticdb.kernels._jit import FLOATS3, INTS, entry, leaf, record_of
 from hapticdb.kernels.force_law import (
     NO_WRENCH,
     NOTHING_NEAR,
@@ -22,20 +22,6 @@ from hapticdb.kernels.query.shell_keys import center_of
 from hapticdb.kernels.records.hand import RESULT
 from hapticdb.kernels.resident.cells import CELL_GRID, CLUSTERS, EMPTY_SLOT, Cells
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
-
-
-@entry(INTS, INTS32, WORDS32_2, INT, types.uint32[::1])
-def spread_out(keys: NDArray[np.int64], slots, words, side, bitmap):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
-    """Write the resident cells of one directory into a bitmap of zeros."""
-    row = side // 32
-    for entry_at in range(keys.shape[0]):
-        if keys[entry_at] < 0 or slots[entry_at] == EMPTY_SLOT:
-            continue
-        ci, cj = keys[entry_at] >> 32, (keys[entry_at] >> 16) & 0xFFFF
-        ck = keys[entry_at] & 0xFFFF
-        for word in range(1024):
-            i, j = (ci << 5) | (word >> 5), (cj << 5) | (word & 31)
-            bitmap[(i * side + j) * row + ck] = words[slots[entry_at], word]
 
 
 @leaf
@@ -87,6 +73,10 @@ def dense_feel(bitmap, shell, poses, place, law, met, out):  # type: ignore[no-u
 
 def dense_bitmap(cells: Cells, which: int, side: int) -> NDArray[np.uint32]:
     """Bitmap of the resident cells of one directory; other cells are empty in the bitmap."""
-    bitmap = np.zeros(side**3 // 32, dtype=np.uint32)
-    spread_out(cells.keys[which], cells.slots[which], cells.words, side, bitmap)
-    return bitmap
+    keys, slots, n = cells.keys[which], cells.slots[which], side // 32
+    held = (keys >= 0) & (slots != EMPTY_SLOT)
+    keys, words = keys[held], cells.words[slots[held]]
+    bitmap = np.zeros((n, 32, n, 32, n), dtype=np.uint32)
+    place = keys >> 32, slice(None), (keys >> 16) & 0xFFFF, slice(None), keys & 0xFFFF
+    bitmap[place] = words.reshape(-1, 32, 32)
+    return bitmap.ravel()

@@ -7,7 +7,6 @@ Environments hold the sample car 1, 10 and 104 times side by side, and once a te
 the same shell goes over the same surfaces in all of them. All sizes of an engine take turns.
 """
 
-import argparse
 import contextlib
 import itertools
 import signal
@@ -26,7 +25,7 @@ import hapticdb
 import page_tables
 import records
 from awake import awake
-from copies import Plan, Source, write_copies
+from copies import Copies
 from hapticdb import Environment, PointShell
 from hapticdb.paper.strategies import Strategy
 from hapticdb.sample import write_sample
@@ -61,15 +60,10 @@ class Effort:
 QUICK = Effort((3e3, 3e4, 1e5), 7, 50)
 
 
-def say(line: str) -> None:
-    """Print a line on standard error."""
-    print(line, file=sys.stderr, flush=True)
-
-
 class ScaleSize(NamedTuple):
     """Places of the copies; the number of cars, below 1 a share of one; poses for one copy."""
 
-    plan: Plan
+    plan: Copies
     copies: float
     at_home: dict[str, Poses]
 
@@ -78,7 +72,7 @@ class ScaleSize(NamedTuple):
         """Conditions that all cells of this size share."""
         return {
             "environment": "sample",
-            "layout": self.plan.source.layout,
+            "layout": self.plan.layout,
             "bits": self.plan.grid.bits,
             "copies": self.copies,
             "object_voxels": self.plan.voxels,
@@ -102,17 +96,17 @@ def sizes_of(folder: Path, effort: Effort) -> list[ScaleSize]:
     options = hapticdb.ImportOptions(grid=grid, distances=False)
     hapticdb.import_files(home, [write_sample(folder / "sample", count=2).car], options)
     with hapticdb.open(home, read_only=True) as env:
-        car, whole = Source.of(env), poses_at_home(env, effort.poses)
+        car, whole = Copies.of(env), poses_at_home(env, effort.poses)
     found = []
     for voxels in effort.sizes:
         copies = round(voxels / car.voxels)
         if copies:
-            found.append(ScaleSize(Plan.of(car, copies), copies, whole))
+            found.append(ScaleSize(car.times(copies), copies, whole))
             continue
-        plan = Plan.of(car.within(voxels), 1)
+        plan = car.within(voxels)
         part = folder / "part.db"
-        with contextlib.closing(create_store(part, plan.grid, car.layout)) as store:
-            write_copies(store, plan)
+        with contextlib.closing(create_store(part, plan.grid, plan.layout)) as store:
+            plan.write(store)
         with hapticdb.open(part, read_only=True) as env:
             poses = poses_at_home(env, effort.poses)
         found.append(ScaleSize(plan, round(plan.voxels / car.voxels, 3), poses))
@@ -128,12 +122,12 @@ def poses_at_home(env: Environment, count: int) -> dict[str, Poses]:
 def built(url: str, size: ScaleSize) -> Cell:
     """Write an environment; its size on disk, and the time that it took."""
     started = time.perf_counter()
-    with contextlib.closing(create_store(url, size.plan.grid, size.plan.source.layout)) as store:
-        write_copies(store, size.plan)
+    with contextlib.closing(create_store(url, size.plan.grid, size.plan.layout)) as store:
+        size.plan.write(store)
     import_s = time.perf_counter() - started
     with hapticdb.open(url, read_only=True) as env:
         stored = env.size()
-        say(f"{env.engine}: {stored.rows:,} rows in {import_s:.1f} s")
+        print(f"{env.engine}: {stored.rows:,} rows in {import_s:.1f} s", flush=True)
         return size.cell | {
             "engine": env.engine,
             "objects": len(env.objects()),
@@ -144,49 +138,30 @@ def built(url: str, size: ScaleSize) -> Cell:
         }
 
 
-class Run:
-    """All strategies over the poses of one kind in one environment."""
-
-    def __init__(self, env: Environment, shell: PointShell, cell: Cell, poses: Poses) -> None:
-        self._env, self._shell, self._poses = env, shell, poses
-        self._alternatives = [
-            Alternative(cell | {"strategy": strategy}, self._frame(strategy))
-            for strategy in STRATEGIES
-        ]
-
-    def _frame(self, strategy: Strategy) -> Callable[[Poses], Any]:
-        return lambda pose: self._env.touch(self._shell, pose, strategy).query
-
-    def turn(self, number: int) -> None:
-        """Measure all strategies on one of `ROUNDS` parts of the poses."""
-        share = np.array_split(self._poses, ROUNDS)[number]
-        in_turns(self._alternatives, share, limit_s=LIMIT_S)
-
-    def cells(self) -> list[Cell]:
-        """Cells of all turns; hits come from one more touch of each pose."""
-        touches = [self._env.touch(self._shell, pose, "array") for pose in self._poses]
-        found = {"hits": float(np.mean([len(touch.hits) for touch in touches]))}
-        cells = [alternative.record() | found for alternative in self._alternatives]
-        return [cell | {"cut_short": cell["frames"] < len(self._poses)} for cell in cells]
+def frames(env: Environment, shell: PointShell, strategy: Strategy) -> Callable[[Poses], Any]:
+    """Frames by one strategy in one environment."""
+    return lambda pose: env.touch(shell, pose, strategy).query
 
 
 def measure(urls: Sequence[str], sizes: Sequence[ScaleSize]) -> list[Cell]:
     """Build all sizes on one engine, then measure frames in them, in turns."""
     storage = [built(url, size) for url, size in zip(urls, sizes, strict=True)]
-    runs = []
+    runs: list[tuple[Poses, list[Alternative]]] = []
     with awake(), contextlib.ExitStack() as opened:
         for url, size, stored in zip(urls, sizes, storage, strict=True):
             shell = sphere_shell(size.plan.grid.voxel_size)
             env = opened.enter_context(hapticdb.open(url, read_only=True))
             with_papers_cache(env)
             env.calibrate(keep=False)
-            conditions = {"file": "cached"}
+            about = stored | {"file": "cached", "points": len(shell)}
             for kind, poses in size.parked_poses().items():
-                cell = stored | conditions | {"points": len(shell), "poses": kind}
-                runs.append(Run(env, shell, cell, poses))
-        for number, run in itertools.product(range(ROUNDS), runs):
-            run.turn(number)
-        return storage + [cell for run in runs for cell in run.cells()]
+                cells = {one: about | {"poses": kind, "strategy": one} for one in STRATEGIES}
+                ways = [Alternative(cells[one], frames(env, shell, one)) for one in STRATEGIES]
+                runs.append((poses, ways))
+        for number, (poses, ways) in itertools.product(range(ROUNDS), runs):
+            in_turns(ways, np.array_split(poses, ROUNDS)[number], limit_s=LIMIT_S)
+    measured = [(len(poses), one.record()) for poses, ways in runs for one in ways]
+    return storage + [cell | {"cut_short": cell["frames"] < count} for count, cell in measured]
 
 
 def evaluate(folder: Path, effort: Effort) -> dict[str, Any]:
@@ -194,7 +169,7 @@ def evaluate(folder: Path, effort: Effort) -> dict[str, Any]:
     sizes = sizes_of(folder, effort)
     names = [f"scale_{size.plan.voxels}" for size in sizes]
     cells = measure([str(folder / f"{name}.db") for name in names], sizes)
-    binaries = max(find_binaries(), key=lambda found: found.major)
+    binaries = find_binaries()[0]
     with serving(folder / "server", binaries, SETTINGS) as server:
         cells += measure([with_environment(server.conninfo(), name) for name in names], sizes)
     inputs = {
@@ -207,16 +182,13 @@ def evaluate(folder: Path, effort: Effort) -> dict[str, Any]:
 
 def main() -> None:
     """Build, measure, and fill the tables of docs/evaluation.md."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="tiny sizes, into results-quick/")
-    given = parser.parse_args()
-    out = Path("results-quick" if given.quick else "results")
+    is_quick, out = records.asked(__doc__, "tiny sizes, into results-quick/")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # servers end, files are removed
     with tempfile.TemporaryDirectory(prefix="hapticdb-scale-") as folder:
-        found = {"scale": evaluate(Path(folder), QUICK if given.quick else Effort())}
+        found = {"scale": evaluate(Path(folder), QUICK if is_quick else Effort())}
     records.write(out, found)
     draw(found, out)
-    if not given.quick:
+    if not is_quick:
         page_tables.refill("docs/evaluation.md", out)
 
 

@@ -62,25 +62,16 @@ QUICK = Budget(0.1, 100, 5, 60, (0, 100, 500, 3000, 100_000), RESOLUTIONS[::3], 
 
 
 def figure_8(subject: Subject, task: Task, finest: QuantileVector, budget: Budget) -> list[Cell]:
-    """Query time by CBGroup against the resolution of the quantile vector, grouping apart.
+    """Query time by CBGroup against the resolution of the quantile vector.
 
     finest : the vector of the largest resolution; the bounds of all others are among its bounds.
     """
-    alternatives = []
-    grouping_us = []
-    for resolution in budget.resolutions:
-        if resolution > finest.resolution:
-            continue
-        vector = coarsened(finest, resolution)
-        query = subject.query(vector)
-        grouping_us.append(_grouping_us(subject, vector, task))
-        alternatives.append(
-            subject.alternative(task, "cbgroup", query=query, resolution=vector.resolution)
-        )
-    cells = _measure(subject, task, alternatives, budget)
-    for cell, us in zip(cells, grouping_us, strict=True):
-        cell["grouping_us"] = us
-    return cells
+    vectors = [coarsened(finest, n) for n in budget.resolutions if n <= finest.resolution]
+    alternatives = [
+        subject.alternative(task, "cbgroup", query=subject.query(one), resolution=one.resolution)
+        for one in vectors
+    ]
+    return in_turns(alternatives, task.poses, limit_s=budget.cell_s)
 
 
 def coarsened(finest: QuantileVector, resolution: int) -> QuantileVector:
@@ -92,38 +83,19 @@ def coarsened(finest: QuantileVector, resolution: int) -> QuantileVector:
     return QuantileVector(finest.bounds[::step].copy(), finest.n_rows, finest.source)
 
 
-def _grouping_us(subject: Subject, vector: QuantileVector, task: Task) -> float:
-    """Median time of grouping alone, over frames that differ as a hand's do."""
-    query = subject.query(vector)
-    located = [locate(task.shell, pose, query.query.grid).keys for pose in task.poses[:200]]
-    times = []
-    for keys in located + located:
-        start = time.perf_counter_ns()
-        cbgroup(keys, keys, vector, subject.costs)
-        times.append(time.perf_counter_ns() - start)
-    return float(np.median(times[len(located) :])) / 1000
-
-
 def figure_9(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
     """MaxGap over MAXGAP, CBGroup, and `array`."""
-    return _measure(subject, task, _maxgap_and_others(subject, task, budget), budget)
+    gaps = [subject.alternative(task, "maxgap", gap=gap) for gap in budget.gaps]
+    ways = gaps + _each(subject, task, ("cbgroup", "array"))
+    return in_turns(ways, task.poses, limit_s=budget.cell_s)
 
 
 def figure_10(
     subject: Subject, shell_task: Task, regions: Sequence[Region], budget: Budget
 ) -> list[Cell]:
     """Figure 9's strategies in regions of low, middle and high density."""
-    cells = []
-    for region in regions:
-        task = Task("random", shell_task.shell, region.poses, region.name, region.density)
-        cells += _measure(subject, task, _maxgap_and_others(subject, task, budget), budget)
-    return cells
-
-
-def _maxgap_and_others(subject: Subject, task: Task, budget: Budget) -> list[Alternative]:
-    """MaxGap for each MAXGAP, and the strategies that it is compared with."""
-    gaps = [subject.alternative(task, "maxgap", gap=gap) for gap in budget.gaps]
-    return gaps + [subject.alternative(task, name) for name in ("cbgroup", "array")]
+    tasks = [Task("random", shell_task.shell, one.poses, one.name, one.density) for one in regions]
+    return [cell for task in tasks for cell in figure_9(subject, task, budget)]
 
 
 def claim(subject: Subject, tasks: Sequence[Task], budget: Budget) -> list[Cell]:
@@ -132,7 +104,8 @@ def claim(subject: Subject, tasks: Sequence[Task], budget: Budget) -> list[Cell]
     for task in tasks:
         for law in list(LAWS)[: 1 + subject.env.has_distances]:
             names = [n for n in COMPARED if law == "plane" or n != "statement"]
-            cells += _measure(subject, task, _each(subject, task, names, law=law), budget)
+            ways = _each(subject, task, names, law)
+            cells += in_turns(ways, task.poses, limit_s=budget.cell_s)
             cells += cold(subject, task, names, law, budget)
     return cells
 
@@ -174,7 +147,7 @@ def in_memory(env: Environment, tasks: Sequence[Task], budget: Budget) -> list[C
 
 
 def _against(bitmap: NDArray[np.uint32], frames: ResidentFrames) -> Callable[[Floats], Query]:
-    """Frames against a bitmap; nothing is asked."""
+    """Frames against a bitmap; nothing is read from the database."""
     out, place = np.zeros(1, RESULT), frames.residency.cell_grid
 
     def frame(pose: Floats) -> Query:
@@ -206,15 +179,11 @@ def grouping(subject: Subject, budget: Budget) -> list[Cell]:
 
 
 def _each(
-    subject: Subject, task: Task, names: Sequence[Strategy], law: str, file: str = "cached"
+    subject: Subject,
+    task: Task,
+    names: Sequence[Strategy],
+    law: str = "plane",
+    file: str = "cached",
 ) -> list[Alternative]:
     """Strategies by name, MaxGap with the paper's MAXGAP."""
     return [subject.alternative(task, name, law=law, file=file) for name in names]
-
-
-def _measure(
-    subject: Subject, task: Task, alternatives: Sequence[Alternative], budget: Budget
-) -> list[Cell]:
-    return in_turns(
-        alternatives, task.poses, limit_s=budget.cell_s, requested_rows=subject.requested_rows(task)
-    )

@@ -36,7 +36,6 @@ class Alternative:
     before: Callable[[], None] | None = None
     times_us: list[float] = field(default_factory=list)
     queries: list[Query] = field(default_factory=list)
-    poses: list[int] = field(default_factory=list)
     spent_s: float = 0.0
 
     def run(self, poses: NDArray[np.float64], indices: Sequence[int], limit_s: float) -> None:
@@ -57,26 +56,13 @@ class Alternative:
             elapsed_us = (time.perf_counter_ns() - start) / 1000
             self.times_us.append(elapsed_us)
             self.queries.append(query)
-            self.poses.append(index)
             self.spent_s += elapsed_us / 1e6
 
-    def record(self, requested_rows: Sequence[int] | None = None) -> Cell:
-        """The cell with everything measured.
-
-        requested_rows : rows under each pose's own keys; what is read beyond them is a false row.
-        """
-        queries = self.queries
-        found: Cell = {
-            **self.cell,
-            "frames": len(queries),
-            "us": summary(self.times_us),
-            "ranges": float(np.mean([query.ranges for query in queries])),
-            "rows": float(np.mean([query.rows for query in queries])),
-        }
-        if requested_rows is not None:
-            asked = float(np.mean([requested_rows[index] for index in self.poses]))
-            found["false_rows"] = found["rows"] - asked
-        return found
+    def record(self) -> Cell:
+        """The cell with everything measured."""
+        found: Cell = {**self.cell, "frames": len(self.queries), "us": summary(self.times_us)}
+        found["ranges"] = float(np.mean([query.ranges for query in self.queries]))
+        return found | {"rows": float(np.mean([query.rows for query in self.queries]))}
 
 
 def in_turns(
@@ -85,13 +71,11 @@ def in_turns(
     *,
     limit_s: float,
     warm: int = WARM_FRAMES,
-    requested_rows: Sequence[int] | None = None,
 ) -> list[Cell]:
     """Measure all alternatives over all poses and return a cell for each.
 
     poses (M, 4, 4): world_from_tool; limit_s : seconds of frames that each may take: one that
-    reaches it stops, and its cell is marked `cut_short`; warm : untimed frames of each before;
-    requested_rows (M,): rows under each pose's own keys: what is read beyond them is a false hit.
+    reaches it stops, and its cell is marked `cut_short`; warm : untimed frames of each before.
 
     The poses are cut into chunks. Every alternative runs each chunk once. In one turn the
     alternatives run different chunks, in an order drawn anew for each turn. So an alternative does
@@ -111,12 +95,7 @@ def in_turns(
         for n in rng.permutation(len(alternatives)).tolist():
             chunk = chunks[(turn + n * stride) % len(chunks)]
             alternatives[n].run(poses, chunk, limit_s)
-    cells = []
-    for alternative in alternatives:
-        cell = alternative.record(requested_rows)
-        cell["cut_short"] = len(alternative.queries) < len(poses)
-        cells.append(cell)
-    return cells
+    return [one.record() | {"cut_short": len(one.queries) < len(poses)} for one in alternatives]
 
 
 def summary(times_us: ArrayLike) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """The plots of docs/evaluation.md: the claim, the paper's figures, users and scale."""
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 from matplotlib import rc_context
@@ -77,36 +78,23 @@ def against_maxgap(cells: Sequence[Cell], by: Sequence[str]) -> Figure:
     return figure
 
 
-def figure_9(cells: Sequence[Cell]) -> Figure:
-    """MaxGap against CBGroup."""
-    return against_maxgap(cells, ("law",))
-
-
-def figure_10(cells: Sequence[Cell]) -> Figure:
-    """The same by voxel density."""
-    return against_maxgap(cells, ("region",))
-
-
 def claim(cells: Sequence[Cell]) -> Figure:
     """Frames a second: a panel a kind of poses, a column of marks a place, a mark a strategy."""
+    place = "engine", "layout", "law", "file"
     kinds = distinct(cells, "poses")
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     figure.subplots(1, len(kinds), sharey="row")
     for axes, kind in zip(figure.axes, kinds, strict=True):
-        own = [c for c in cells if c["poses"] == kind and c["strategy"] != "bitmap"]
-        places = list(grouped(own, ("engine", "layout", "law", "file")))
-        for strategy in distinct(own, "strategy"):
-            marks = [c for c in own if c["strategy"] == strategy]
-            x = [
-                places.index(tuple(c[k] for k in ("engine", "layout", "law", "file")))
-                for c in marks
-            ]
-            axes.plot(
-                x, [1e6 / typical(c) for c in marks], "o", markersize=4, label=named(strategy)
-            )
-        for cell in cells:
-            if (cell["strategy"], cell["poses"]) == ("bitmap", kind):
+        all_ = [cell for cell in cells if cell["poses"] == kind]
+        own = [cell for cell in all_ if cell["strategy"] != "bitmap"]
+        places = list(grouped(own, place))
+        for (strategy,), marks in grouped(own, ("strategy",)).items():
+            x = [places.index(tuple(cell[key] for key in place)) for cell in marks]
+            y = [1e6 / typical(cell) for cell in marks]
+            axes.plot(x, y, "o", markersize=4, label=named(strategy))
+        for cell in all_:
+            if cell["strategy"] == "bitmap":
                 axes.axhline(1e6 / typical(cell), color="black", label="dense bitmap in memory")
         axes.axhline(1e6 / FRAME_US, color="grey", linestyle="--", label="the paper: 1,000")
         names = [
@@ -134,8 +122,8 @@ def scale(cells: Sequence[Cell]) -> Figure:
 
 PLOTS: dict[str, Callable[[Sequence[Cell]], Figure]] = {
     "figure8": figure_8,
-    "figure9": figure_9,
-    "figure10": figure_10,
+    "figure9": partial(against_maxgap, by=("law",)),
+    "figure10": partial(against_maxgap, by=("region",)),
     "claim": claim,
     "scale": scale,
 }

@@ -81,11 +81,6 @@ class Subject:
         }
         return Alternative(cell, asking(query or self.query(), task.shell, strategy, law, gap))
 
-    def requested_rows(self, task: Task) -> list[int]:
-        """Rows under each pose's own keys."""
-        ask = asking(self.query(), task.shell, "array", "plane", None)
-        return [ask(pose).rows for pose in task.poses]
-
 
 def asking(
     query: Strategies, shell: PointShell, strategy: Strategy, law: str, gap: int | None

@@ -153,7 +153,7 @@ def test_feel_simulated_device(run: Run) -> None:
         ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
         ([*PLAY, "--budget", 0.5], ["--budget", "'0.5': give MiB"]),
         ([*PLAY, "--stiffness", 1e300], ["stiffness of 1e+300 N/m", "above 0, up to 1e+09"]),
-        ([*PLAY, "--law", "plane", "--rendering", "coupled"], ["coupled needs distances"]),
+        ([*PLAY, "--law", "plane", "--rendering", "coupled"], ["coupled needs the law distance"]),
         ([*PLAY, "--rendering", "direct", "--delay", 5], ["--delay", "with --rendering direct"]),
         ([*PLAY, "--exclude", "nobody"], ["--exclude", "nobody"]),
         ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),

@@ -43,8 +43,7 @@ def rendering_of(rendering: Rendering | None, law: ForceLaw) -> Rendering:
         raise UsageError(f"rendering {rendering!r}: choose one of {', '.join(RENDERINGS)}")
     if rendering == "coupled" and not isinstance(law, DistanceField):
         raise UsageError(
-            "the rendering coupled computes contacts by the law distance: choose that, or the "
-            "rendering direct"
+            "the rendering coupled needs the law distance: choose that, or the rendering direct"
         )
     return rendering
 

@@ -181,7 +181,7 @@ def test_session_incompatible_law_and_coupling(
 ) -> None:
     with pytest.raises(UsageError, match="does not go with the rendering direct"):
         Session(cells, ball, still(0.03), law="plane", coupling=Coupling(stiffness=100.0))
-    with pytest.raises(UsageError, match="the rendering coupled computes contacts by"):
+    with pytest.raises(UsageError, match="the rendering coupled needs the law distance"):
         Session(cells, ball, still(0.03), law="plane", rendering="coupled")
     with pytest.raises(UsageError, match="rendering 'soft': choose one of coupled, direct"):
         Session(cells, ball, still(0.03), rendering="soft")  # type: ignore[arg-type]

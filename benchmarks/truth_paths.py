@@ -5,8 +5,8 @@ import subprocess
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator, Sequence
-from itertools import combinations
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +24,8 @@ from test_mesh_proofs import MM
 from truth_shapes import PLACES, ROUNDED, Case, boxed, opened, said_of
 
 Floats = NDArray[np.float64]
-Solid = tuple[Any, Floats]
-"""coal's solid, mm, and its pose (4, 4), metres."""
+Solid = tuple[Any, Any]
+"""coal's solid and its pose, mm."""
 ROUND = 2e-5
 """Metres by which the triangles around a cylinder are farther out than it."""
 PLANNER = """
@@ -79,12 +79,15 @@ json.dump(told, sys.stdout)
 """
 
 
-def apart(one: Solid, other: Solid) -> float:
-    """Signed distance of two placed solids, metres."""
-    (a, here), (b, there) = one, other
-    at = [coal.Transform3s(pose[:3, :3].copy(), MM * pose[:3, 3]) for pose in (here, there)]
+def at(pose: Floats) -> Any:  # noqa: ANN401 - coal has no types
+    """coal's pose, mm, of one in metres."""
+    return coal.Transform3s(pose[:3, :3].copy(), MM * pose[:3, 3])
+
+
+def least_of(pairs: Iterable[tuple[Solid, Solid]]) -> float:
+    """Least signed distance of placed solids, metres."""
     request, found = coal.DistanceRequest(), coal.DistanceResult()
-    return float(coal.distance(a, at[0], b, at[1], request, found)) / MM
+    return min(float(coal.distance(*a, *b, request, found)) for a, b in pairs) / MM
 
 
 def scene_of(boxes: Sequence[tuple[Floats, Floats]], folder: str) -> Environment:
@@ -154,7 +157,7 @@ class Arm(NamedTuple):
             )
             middle = np.eye(4)
             middle[2, 3] = 0.5 * z
-            out.append((solid, pose @ middle))
+            out.append((solid, at(pose @ middle)))
         return out
 
 
@@ -176,7 +179,7 @@ def machines(until: float) -> Iterator[Case]:
         with tempfile.TemporaryDirectory() as folder, scene_of(boxes, folder) as env:
             file = Path(folder, "arm.urdf")
             file.write_text(arm.urdf())
-            solids = [(coal.Box(*(MM * size)), pose) for size, pose in boxes]
+            solids = [(coal.Box(*(MM * size)), at(pose)) for size, pose in boxes]
             for _ in range(10):
                 rows = rng.uniform(-0.7, 0.7, (3, n - 1)) * np.where(arm.is_slide[1:], 0.02, 1.0)
                 if time.monotonic() < until and nearest(arm, rows[0], solids) > 1e-3:
@@ -186,16 +189,15 @@ def machines(until: float) -> Iterator[Case]:
 def nearest(arm: Arm, q: Floats, solids: list[Solid]) -> float:
     """Least signed distance, metres, of an arm from the boxes and from itself."""
     links = arm.placed(q)
-    among = [(a, b) for a in links for b in solids] + [*combinations(links, 2)]
-    return min(apart(a, b) for a, b in among)
+    return least_of(chain(product(links, solids), combinations(links, 2)))
 
 
 def moved(env: Environment, arm: Arm, file: Path, rows: Floats, solids: list[Solid]) -> Case:
     """One joint path."""
     found = hapticdb.sweep_machine(env, file, rows)
     assert not any("not tested" in note for note in found.notes), found.notes
-    at = np.linspace(0.0, len(rows) - 1, PLACES // 4)
-    values = np.stack([np.interp(at, range(len(rows)), one) for one in rows.T], axis=1)
+    shares = np.linspace(0.0, len(rows) - 1, PLACES // 4)
+    values = np.stack([np.interp(shares, range(len(rows)), one) for one in rows.T], axis=1)
     if found.gap.place is not None:
         there = found.path.at([found.gap.place.fraction * found.path.length])
         values = np.concatenate([values, there])
@@ -231,11 +233,11 @@ def planned(python: str, until: float) -> Iterator[Case]:
 
 def followed(scene: dict[str, Any], shell: PointShell, states: Floats) -> Case:
     """One path: straight, with even turns about the tool's origin."""
-    at = np.linspace(0.0, len(states) - 1, PLACES * (len(states) - 1) // 4)
+    shares = np.linspace(0.0, len(states) - 1, PLACES * (len(states) - 1) // 4)
     given = range(len(states))
     turns = Slerp(given, Rotation.from_quat(states[:, 3:]))
-    poses, dense = np.tile(np.eye(4), (len(states), 1, 1)), np.tile(np.eye(4), (len(at), 1, 1))
-    for path, when in ((poses, given), (dense, at)):
+    poses, dense = np.tile(np.eye(4), (len(states), 1, 1)), np.tile(np.eye(4), (len(shares), 1, 1))
+    for path, when in ((poses, given), (dense, shares)):
         path[:, :3, :3] = turns(when).as_matrix()
         path[:, :3, 3] = np.stack([np.interp(when, given, x) for x in states[:, :3].T], 1) / MM
     boxes = []
@@ -250,12 +252,10 @@ def followed(scene: dict[str, Any], shell: PointShell, states: Floats) -> Case:
         found = hapticdb.sweep(env, shell, poses, about=(0.0, 0.0, 0.0))
     if found.gap.place is not None:
         dense = np.concatenate([dense, found.gap.place.pose[None]])
-    solids, tool = [(coal.Box(*(MM * size)), pose) for size, pose in boxes], []
+    solids, tool = [(coal.Box(*(MM * size)), at(pose)) for size, pose in boxes], []
     for size, middle in scene["tool"]:
         own = np.eye(4)
         own[:3, 3] = np.array(middle) / MM
         tool.append((coal.Box(*map(float, size)), own))
-    least = min(
-        apart(one, (part, pose @ own)) for pose in dense for part, own in tool for one in solids
-    )
-    return compared(found, least)
+    moving = [(part, at(pose @ own)) for pose in dense for part, own in tool]
+    return compared(found, least_of(product(moving, solids)))

@@ -328,7 +328,9 @@ def pair_case(found: Clash | None, apart: float, a: Floats, b: Floats) -> Case:
 def step_fits(python: str, until: float) -> Iterator[Case]:
     """Shafts in hubs as true cylinders, files of build123d: their distance beside the nominal."""
     with tempfile.TemporaryDirectory() as folder:
+        share = until - time.monotonic()
         subprocess.run([python, "-c", STEP], cwd=folder, check=True, timeout=300)
+        until = time.monotonic() + share
         for name, nominal in NOMINAL.items():
             if time.monotonic() > until:
                 break

@@ -159,6 +159,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", default="", help=f"a Python that has {PEERS[name]}")
     chosen = parser.parse_args()
     rows: list[dict[str, object]] = []
+    next(open_shapes(np.inf))  # compiles the kernels
     oracles: dict[tuple[str, str], Callable[[float], Iterator[Case]]] = {
         ("open shapes past one another", "coal"): open_shapes,
         ("sweeps in contact", "coal"): in_contact,

@@ -8,7 +8,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 # Three tests run on each two processors: most of them wait for servers half of their time.
 PYTEST := $(BIN)/pytest tests --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) --dist=worksteal
 
-.PHONY: demo test test-long test-browser test-all test-plain lint types figures peers realtime feel scale paths clashes site release pins clean
+.PHONY: demo test test-long test-browser test-all test-plain lint types figures peers realtime feel scale paths clashes waits site release pins clean
 
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
@@ -43,7 +43,7 @@ types: $(READY)
 
 # The measurements behind docs/; ARGS=--quick for a first look, into results-quick/. Real assemblies are read
 # from the folder that HAPTICDB_TEST_DATA names; without it the sample car stands in for them.
-figures realtime feel paths clashes: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
+figures realtime feel paths clashes waits: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
 
 # docs/evaluation.md, on SQLite and every PostgreSQL found: a quarter of an hour
 figures: $(READY)
@@ -67,9 +67,14 @@ feel: $(READY)
 paths: $(READY) .venv/figures
 	$(BIN)/python benchmarks/batches.py $(ARGS)
 
-# docs/clashes.md: every pair of 4,284 parts
+# docs/clashes.md: every pair of 4,284 parts, and of four scenes
 clashes: $(READY)
-	$(BIN)/python benchmarks/clashes.py $(ARGS)
+	$(BIN)/python benchmarks/clashes.py
+
+# what people wait for: every verb first and again, 20 pulls, clashes, hands at 1 and 5 kHz: eight minutes
+waits: $(READY) clashes
+	$(BIN)/python benchmarks/waits.py $(ARGS)
+	$(BIN)/python benchmarks/periods.py
 
 peers: .venv/figures
 

@@ -1,4 +1,4 @@
-"""What an environment costs: time and memory of an import, bytes of a voxel, and the first start.
+"""What an environment costs: time and memory of an import, and bytes of a voxel.
 
 Each import runs in a process of its own, with every kernel compiled.
 """
@@ -7,7 +7,6 @@ import argparse
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -16,22 +15,11 @@ from typing import Any, NamedTuple
 
 import hapticdb
 from hapticdb import GridOptions, ImportOptions
-from hapticdb.kernels._machine_code import GROUPS
-from hapticdb.kernels._sets import fitting_set
 from hapticdb.mesh import read_file
-from hapticdb.sample import SampleFiles
 
 PEAK = re.compile(r"VmHWM:\s+(\d+) kB")
 LONGEST_S = 1800.0
 """Seconds after which a command counts as hung."""
-PACKAGE = Path(hapticdb.__file__).parent
-FIRST = {
-    "import": ("import", "{turn}.db", "{car}", "--bits", "8", "--extent", "1.6"),
-    "touch": ("touch", "{turn}.db", "--tool", "{tool}", "--poses", "{path}"),
-    "sweep": ("sweep", "{turn}.db", "--tool", "{tool}", "--path", "{path}"),
-    "feel": ("feel", "{turn}.db", "--tool", "{tool}", "--device", "{path}", "--seconds", "0.2"),
-}
-"""Commands of a first start."""
 
 
 class Model(NamedTuple):
@@ -87,33 +75,6 @@ def measured(folder: Path, model: Model, bits: int) -> dict[str, Any]:
             cell |= {"objects": len(objects), "object_voxels": sum(obj.voxels for obj in objects)}
         url.unlink()
     return cell
-
-
-def first_start(folder: Path, sample: SampleFiles) -> list[dict[str, Any]]:
-    """Seconds of first commands of a new copy as a wheel has it, and of the same commands again."""
-    places = {"car": sample.car, "tool": sample.spanner, "path": sample.path}
-    shutil.copytree(
-        PACKAGE, folder / "hapticdb", ignore=shutil.ignore_patterns("__pycache__", "_machine")
-    )
-    for group in GROUPS:
-        fitting = fitting_set(group)
-        assert fitting is not None
-        shutil.copytree(fitting[0], folder / "hapticdb/kernels/_machine" / group)
-    variables = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": str(folder)}
-    cells = []
-    for name, words in FIRST.items():
-        cell: dict[str, Any] = {"command": name}
-        for turn in ("first", "again"):
-            line = [word.format(turn=turn, **places) for word in words]
-            began = time.perf_counter()
-            subprocess.run(
-                [sys.executable, "-m", "hapticdb", *line],
-                cwd=folder, env=variables, check=name != "sweep", capture_output=True,
-                timeout=LONGEST_S,
-            )  # fmt: skip
-            cell[f"{turn}_s"] = time.perf_counter() - began
-        cells.append(cell)
-    return cells
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ is none. All inputs are made in a temporary folder: environments on SQLite and o
 PostgreSQL found. Their caches have 4 MB, as in the paper.
 """
 
-import argparse
 import os
 import signal
 import sys
@@ -188,10 +187,7 @@ def evaluate(
         evaluation.add({"visits": visited(evaluation, models)})
     many_at_once(evaluation, effort)
     evaluation.say("costs")
-    evaluation.add({
-        "costs": [costs.measured(folder, model, bits) for model in models],
-        "first_start": costs.first_start(folder, sample),
-    })  # fmt: skip
+    evaluation.add({"costs": [costs.measured(folder, model, bits) for model in models]})
     inputs = dict(INPUTS) | {
         "model": f"{models[0].name}, {bits} bits, extent {models[0].extent}",
         "cache": "of the database, 4 MB; 1 GB on PostgreSQL where many read at once",
@@ -205,18 +201,15 @@ def evaluate(
 
 def main() -> None:
     """Measure, write JSON and plots, and fill the page's tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="a coarse model, few frames")
-    quick = parser.parse_args().quick
-    out = Path("results-quick" if quick else "results")
+    is_quick, out = records.asked(__doc__, "a coarse model, few frames")
     # SIGTERM raises an exit, so that servers are stopped and files removed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with tempfile.TemporaryDirectory(prefix="hapticdb-figures-") as folder:
-        sizes = (9, QUICK, many.QUICK) if quick else (11, Budget(), many.Effort())
+        sizes = (9, QUICK, many.QUICK) if is_quick else (11, Budget(), many.Effort())
         found = evaluate(Path(folder), *sizes)
     records.write(out, found)
     draw(found, out)
-    page_tables.refill("docs/evaluation.md", out, out / "evaluation.md" if quick else None)
+    page_tables.refill("docs/evaluation.md", out, out / "evaluation.md" if is_quick else None)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,14 @@
-"""Lateness and computing time of periods with several slots, two trees in turns.
+"""Hands: lateness and computing time of periods with several slots.
 
-    python benchmarks/periods.py --before /tmp/before/src --rate 5000 --slots 1 16
+    python benchmarks/periods.py [--old CHECKOUT] [--rates 1000 5000] [--slots 1 16]
 
-Each turn is a process with one host: its hands press a ball of points on a plate. Printed are
-the median slot's p50, and the latest slot's p99 and p99.9 in us, medians over the turns, and the
-ratio after / before of each.
+Each turn is a process with one host: its hands press a ball of points on a plate. The results are
+the median slot's p50, and the latest slot's p99 and p99.9 in us, medians over the turns. With
+another checkout, the two take turns.
 """
 
 import argparse
+import itertools
 import json
 import os
 import subprocess
@@ -19,11 +20,14 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from trimesh.transformations import translation_matrix
 
 import hapticdb
+import records
 from hapticdb.session.host import SessionHost
+from page_tables import publish
 
-TURNS, SECONDS = 5, 4.0
+TURNS, SECONDS, POINTS = 3, 4.0, 300
 VOXEL, RADIUS = 0.002, 0.012
 MOVES_PER_SECOND = 30
 NAMES = ("late p50", "late p99", "late p99.9", "took p50", "took p99", "took p99.9")
@@ -50,15 +54,16 @@ def ball(n_points: int) -> hapticdb.PointShell:
     return hapticdb.PointShell(RADIUS * out, -out, np.zeros(3))
 
 
-def measured(file: str, n_slots: int, rate: float, n_points: int) -> list[float]:
+def measured(file: str, n_slots: int, rate: float) -> list[float]:
     """Figures of one turn, us, in the order of NAMES."""
-    pose = np.eye(4)
     with SessionHost(file, rate=rate) as host:
-        sessions = [host.begin(ball(n_points), pose + _up(0.03)) for _ in range(n_slots)]
+        begin = translation_matrix((0.0, 0.0, 0.03))
+        sessions = [host.begin(ball(POINTS), begin) for _ in range(n_slots)]
         end = time.monotonic() + SECONDS
         while (left := end - time.monotonic()) > 0.0:
             for n, session in enumerate(sessions):
-                session.move(pose + _up(RADIUS - 0.001 + 0.002 * np.sin(8.0 * left + n)))
+                z = RADIUS - 0.001 + 0.002 * np.sin(8.0 * left + n)
+                session.move(translation_matrix((0.0, 0.0, z)))
             time.sleep(1.0 / MOVES_PER_SECOND)
         found = [session.figures() for session in sessions]
     spreads: list[Any] = [[figures.lateness for figures in found], [f.elapsed for f in found]]
@@ -73,44 +78,37 @@ def measured(file: str, n_slots: int, rate: float, n_points: int) -> list[float]
     ]
 
 
-def _up(z: float) -> Any:  # noqa: ANN401 - (4, 4)
-    shift = np.zeros((4, 4))
-    shift[2, 3] = z
-    return shift
-
-
 def main() -> None:
     """Take turns, or be one."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--before", type=Path, help="src of the other tree; none: this one twice")
-    options.add_argument("--slots", nargs="+", default=[1, 16, 64], type=int)
-    options.add_argument("--rate", default=1000.0, type=float, help="Hz")
-    options.add_argument("--points", default=300, type=int)
+    options = argparse.ArgumentParser(description=records.first_line(__doc__))
+    options.add_argument("--old", type=Path, help="another checkout, measured in turns")
+    options.add_argument("--slots", nargs="+", default=[1, 16], type=int)
+    options.add_argument("--rates", nargs="+", default=[1000.0, 5000.0], type=float, help="Hz")
     options.add_argument("--turn", help=argparse.SUPPRESS)
     given = options.parse_args()
-    here = Path(__file__).parents[1] / "src"
     if given.turn:
-        print(json.dumps(measured(given.turn, given.slots[0], given.rate, given.points)))
+        print(json.dumps(measured(given.turn, given.slots[0], given.rates[0])))
         return
+    sides = {"this": records.ROOT} | ({"old": given.old.resolve()} if given.old else {})
+    cells: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "plate.db")
         plate(file)
-        for n_slots in given.slots:
-            turns: dict[str, list[Any]] = {"before": [], "after": []}
-            for _ in range(TURNS):
-                for side, source in (("before", given.before or here), ("after", here)):
-                    line = [sys.executable, __file__, "--turn", str(file), "--slots", f"{n_slots}"]
-                    line += ["--rate", f"{given.rate}", "--points", f"{given.points}"]
-                    variables = os.environ | {"PYTHONPATH": str(source)}
-                    done = subprocess.run(
-                        line, env=variables, capture_output=True, text=True, timeout=300, check=True
-                    )
-                    turns[side].append(json.loads(done.stdout.splitlines()[-1]))
-            before, after = (np.median(turns[side], axis=0) for side in ("before", "after"))
-            scene = f"{n_slots} slots at {given.rate:g} Hz, {given.points} points"
-            print(f"{scene}, {TURNS} turns of {SECONDS:g} s, load {os.getloadavg()[0]:.1f}")
-            for name, one, two in zip(NAMES, before, after, strict=True):
-                print(f"  {name:<10} {one:9.1f} -> {two:9.1f} us  {two / max(one, 1e-9):6.3f}")
+        for rate, n_slots in itertools.product(given.rates, given.slots):
+            turns: dict[str, list[Any]] = {side: [] for side in sides}
+            for side, checkout in [*sides.items()] * TURNS:
+                line = [sys.executable, __file__, "--turn", str(file), "--slots", f"{n_slots}"]
+                line += ["--rates", f"{rate}"]
+                variables = os.environ | {"PYTHONPATH": str(checkout / "src")}
+                done = subprocess.run(
+                    line, env=variables, capture_output=True, text=True, timeout=300, check=True
+                )
+                turns[side].append(json.loads(done.stdout.splitlines()[-1]))
+            for side, found in turns.items():
+                us = dict(zip(NAMES, np.median(found, axis=0).tolist(), strict=True))
+                cells.append({"rate": rate, "hands": n_slots, "side": side, "us": us})
+                print(cells[-1], flush=True)
+    publish("periods", cells, {"points": POINTS, "turns": TURNS, "seconds": SECONDS})
 
 
 if __name__ == "__main__":

@@ -18,9 +18,10 @@ import many
 import page_tables
 import records
 import scale
-import warm
+import waits
 from feel.measures import MEASURES
 from hapticdb import GridOptions, ImportOptions, PointShell
+from hapticdb.cli import app
 from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import LAYOUTS
@@ -84,7 +85,7 @@ def test_measure_batch_peers_agree_far_from_parts(tmp_path: Path) -> None:
     for cell in found["cells"]:
         if (cell["situation"], cell["question"]) == ("free", "touch"):
             assert {side["agree"] for side in cell["sides"].values()} == {1.0}
-            assert len(cell["sides"]) == 7 - len(missing)
+            assert len(cell["sides"]) == 8 - len(missing)
 
 
 def test_removal_paths_spark_plug_keeps_proved_gap(tmp_path: Path) -> None:
@@ -129,7 +130,8 @@ def test_measure_feeling_all_cells_and_curves(tmp_path: Path, sample: SampleFile
     assert {(c["curve"], c["law"]) for c in curves} == {one[:2] for one in feeling.PANELS}
 
 
-def test_measure_warm_all_verbs(tmp_path: Path) -> None:
-    cells = warm.measure(tmp_path, {"this": records.ROOT}, 1)
-    assert [cell["verb"] for cell in cells] == [*warm.VERBS]
-    assert all(cell["cpu_s"] > 0.0 for cell in cells)
+def test_measure_waits_all_verbs_and_a_page(tmp_path: Path) -> None:
+    verbs = {command.split()[0] for command in waits.COMMANDS}
+    assert verbs == {command.name for command in app.registered_commands} - {"grant"}
+    cells = waits.measure(tmp_path, {"this": records.ROOT}, 1, ["info car.db", "serve car.db"])
+    assert all(cell[turn]["cpu_s"] > 0.0 for cell in cells for turn in ("first", "again"))

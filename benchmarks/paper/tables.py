@@ -21,6 +21,8 @@ COMPARED = ("points", "statement", "array", "maxgap", "cbgroup")
 """Strategies of the claim, in the order of its columns."""
 SHOWN = (1, 8, 32)
 """Numbers of readers in the table; the plot has all."""
+PULLED = {0: "come out", 4: "leave an overlap", 1: "are blocked", 3: "not decided"}
+"""Answers of `extract` by straight pulls, by its exit codes."""
 CLOSE = 1.05
 """CBGroup counts as good as the best MAXGAP up to this ratio of their times."""
 
@@ -144,22 +146,46 @@ def costs(results: Results) -> str:
     return table([*head, "peak, MB"], rows)
 
 
-def first_start(results: Results) -> str:
-    """Seconds of first commands, and of the same commands again."""
-    return "\n".join(
-        f"- `{cell['command']}`: {cell['first_s']:.1f} s the first time, "
-        f"{cell['again_s']:.1f} s from then on."
-        for cell in cells_of(results, "first_start")
+def waits(results: Results) -> str:
+    """Seconds of each verb, first and again; processor time and memory of the latter."""
+    return listed(
+        [cell for cell in cells_of(results, "waits") if cell["side"] == "this"],
+        {
+            "verb": lambda cell: f"`{cell['command'].split()[0]}`",
+            "first, s": lambda cell: f"{cell['first']['s']:.2f}",
+            "again, s": lambda cell: f"{cell['again']['s']:.2f}",
+            "processor, s": lambda cell: f"{cell['again']['cpu_s']:.2f}",
+            "MB": lambda cell: f"{cell['again']['peak_mb']:,.0f}",
+        },
     )
 
 
-def warm(results: Results) -> str:
-    """Processor time of verbs after compilation, with the tool in the cache."""
-    return "\n".join(
-        f"- `{cell['verb']}`: {cell['cpu_s']:.2f} s of processor time."
-        for cell in cells_of(results, "warm")
-        if cell["side"] == "this"
+def pulls(results: Results) -> str:
+    """Answers and seconds of pulls."""
+    cells = cells_of(results, "pulls")
+    codes, s = [cell["code"] for cell in cells], [cell["s"] for cell in cells]
+    said = ", ".join(f"{codes.count(code)} {answer}" for code, answer in PULLED.items())
+    return f"- {said}; median {np.median(s):.1f} s, worst {max(s):.1f} s."
+
+
+def clash_seconds(results: Results) -> str:
+    """Processor time and memory of every search."""
+    return listed(
+        cells_of(results, "clashes"),
+        {
+            "scene": lambda cell: f"{cell['scene']}, {cell['search']}",
+            "pairs": lambda cell: f"{cell['pairs']:,}",
+            "processor, s": lambda cell: us_text(cell["cpu_s"]),
+            "MB": lambda cell: us_text(cell["peak_mb"]),
+        },
     )
+
+
+def hands(results: Results) -> str:
+    """Lateness and computing time of periods, us."""
+    cells = [cell for cell in cells_of(results, "periods") if cell["side"] == "this"]
+    rows = [[f"{c['hands']}", f"{c['rate']:,.0f}", *map(us_text, c["us"].values())] for c in cells]
+    return table(["hands", "Hz", *cells[0]["us"]], rows)
 
 
 def grouping(results: Results) -> str:
@@ -279,12 +305,14 @@ def speed(results: Results) -> str:
         ns = {
             name: 1e9 / side["poses_per_s"] / cell["points"] for name, side in cell["sides"].items()
         }
-        own = ["hapticdb, one thread", "hapticdb, with force, one thread"]
+        own = [f"hapticdb, {how}" for how in ("one thread", "with force, one thread")]
+        own += ["hapticdb, dense bitmap"] * (cell["question"] == "touch")
         best = min((name for name in ns if not name.startswith("hapticdb")), key=ns.__getitem__)
         row = rows.setdefault((cell["situation"], f"{cell['points']:,}"), [])
-        row += [us_text(ns[name]) for name in own if name in ns]
+        row += [us_text(ns.get(name)) for name in own if name in ns or "bitmap" in name]
         row.append(f"{us_text(ns[best])} ({best})")
-    head = ["tool is", "points", "first hit", "force", "other's hit", "how far", "other's"]
+    head = ["tool is", "points", "first hit", "force", "on a bitmap", "other's hit"]
+    head += ["how far", "other's"]
     return table(head, [[*place, *row] for place, row in rows.items()])
 
 
@@ -328,8 +356,10 @@ EVALUATION: dict[str, Callable[[Results], str]] = {
     "exactness": exactness,
     "speed": speed,
     "costs": costs,
-    "first-start": first_start,
-    "warm": warm,
+    "waits": waits,
+    "pulls": pulls,
+    "clashes-seconds": clash_seconds,
+    "hands": hands,
     "growth": growth,
     "scale-growth": scale_growth,
     "evaluation-conditions": conditions,

@@ -8,11 +8,12 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hapticdb import PointShell
 from hapticdb.errors import UsageError
 from hapticdb.pointshell.coverage import Interior
-from hapticdb.pointshell.orientation import orient
+from hapticdb.pointshell.orientation import CRACK, orient
 
 Floats = NDArray[np.float64]
 
@@ -86,3 +87,20 @@ def test_interior_open_surface_empty() -> None:
     torn = Interior(orient(np.array(box.triangles[:-1])))
     assert not torn
     assert not torn.holds(np.zeros((1, 3))).any()
+
+
+@pytest.mark.parametrize(("off", "is_solid"), [(0.0, True), (0.5, True), (20.0, False)])
+def test_interior_t_junctions(off: float, is_solid: bool) -> None:
+    """The front of a cube ends at corners that the faces beside it lack, off by some cracks."""
+    box, rng = trimesh.creation.box((1.0, 1.0, 1.0)), np.random.default_rng(3)
+    triangles = list(np.array(box.triangles))
+    for _ in range(5):
+        a, b, c = triangles.pop(0)
+        middle = a + rng.uniform(0.2, 0.8) * (b - a) + off * CRACK * np.sqrt(3.0) * (c - b)
+        triangles += [np.array([a, middle, c]), np.array([middle, b, c])]
+    turned = np.array(triangles) @ Rotation.random(random_state=rng).as_matrix().T
+    interior = Interior(orient(turned))
+    assert bool(interior) == is_solid
+    places = rng.uniform(-0.28, 0.28, (50, 3))
+    assert (interior.holds(places) == is_solid).all()
+    assert not interior.holds(places + 2.0).any()

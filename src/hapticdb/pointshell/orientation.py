@@ -17,6 +17,9 @@ from hapticdb.kernels.surfaces import triangle_bvh as kernels
 JOIN = 1e-6
 """Distance up to which corners of open edges are joined, as a share of the bounding box's diagonal.
 A larger value closes wider gaps, and also joins the corners of small details."""
+CRACK = 1e-5
+"""Distance up to which a corner lies on an open edge, likewise: of a part of a metre, 0.01 mm, the
+tolerance of sweeps. A larger value encloses more, and overlooks wider cracks."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -99,7 +102,7 @@ def _sides_of(faces: Ints, triangles: Floats) -> tuple[_Sides, bool]:
     edges = _edges_of(faces)
     patch, is_flipped = _wind(faces, edges)
     normals[is_flipped] *= -1.0
-    body = _bodies(len(faces), edges)
+    body = _bodies(faces, edges, triangles)
     sides = _Sides(triangles, triangles.mean(axis=1), normals, areas, patch, body, is_flipped)
     return sides, not bool((edges.uses % 2).any())
 
@@ -253,15 +256,57 @@ def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
     return _dense(patch), is_flipped
 
 
-def _bodies(n_faces: int, edges: _Edges) -> Ints:
-    """Body (F,) of each face: 1, 2, ... for closed bodies of faces that share edges, 0 for open."""
-    pairs = _neighbours(edges.number, np.arange(3 * n_faces))
-    body = components(pairs // 3, n_faces)
-    is_open = np.zeros(n_faces, dtype=bool)
-    is_open[body[np.flatnonzero((edges.uses % 2 == 1)[edges.number]) // 3]] = True
+def _bodies(faces: Ints, edges: _Edges, triangles: Floats) -> Ints:
+    """Body (F,) of each face: 1, 2, ... for closed bodies of faces that share edges, 0 for open.
+
+    Open edges are cut at the corners on them: a T-junction is closed.
+    """
+    number, owner, uses = edges.number, np.arange(faces.size) // 3, edges.uses
+    is_open = (uses % 2 == 1)[number]
+    if is_open.any():
+        pieces, of = _cut(faces, np.flatnonzero(is_open), triangles)
+        number = np.append(number[~is_open], pieces + len(uses))
+        owner = np.append(owner[~is_open], of)
+        uses = np.bincount(number)
+    body = components(owner[_neighbours(number, np.arange(len(number)))], len(faces))
+    is_torn = np.zeros(len(faces), dtype=bool)
+    is_torn[body[owner[(uses % 2 == 1)[number]]]] = True
     body += 1
-    body[is_open[body - 1]] = 0
+    body[is_torn[body - 1]] = 0
     return _dense(np.append(body, 0))[:-1]
+
+
+def _cut(faces: Ints, sides: Ints, triangles: Floats) -> tuple[Ints, Ints]:
+    """Pieces (P,) of open sides, a number for each two corners, and the face (P,) of each."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - half a second, for torn files alone
+
+    begins, ends = (
+        one.reshape(-1, 3)[sides] for one in (triangles, np.roll(triangles, -1, axis=1))
+    )
+    tails, heads = (one.ravel()[sides] for one in (faces, np.roll(faces, -1, axis=1)))
+    loose, first = np.unique(tails, return_index=True)
+    along = ends - begins
+    squares = np.maximum((along**2).sum(axis=1), np.finfo(np.float64).tiny)
+    tree = cKDTree(begins[first])
+    near = tree.query_ball_point(0.5 * (begins + ends), 0.5 * np.sqrt(squares))
+    side = np.repeat(np.arange(len(sides)), [len(some) for some in near])
+    corner = np.concatenate(near).astype(np.int64)
+    arms = begins[first[corner]] - begins[side]
+    shares = (arms * along[side]).sum(axis=1) / squares[side]
+    off = np.linalg.norm(arms - shares[:, None] * along[side], axis=1)
+    is_on = off <= CRACK * float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
+    is_on &= (loose[corner] != tails[side]) & (loose[corner] != heads[side])
+    # corners of each side from its tail to its head
+    everywhere = np.arange(len(sides))
+    side = np.concatenate([everywhere, everywhere, side[is_on]])
+    place = np.concatenate([np.full(len(sides), -1.0), np.full(len(sides), 2.0), shares[is_on]])
+    corner = np.concatenate([tails, heads, loose[corner[is_on]]])
+    order = np.lexsort((place, side))
+    side, corner = side[order], corner[order]
+    two = np.sort(np.stack([corner[:-1], corner[1:]], axis=1), axis=1)[side[:-1] == side[1:]]
+    of = side[:-1][side[:-1] == side[1:]]
+    keys = two[:, 0] * (faces.max() + 1) + two[:, 1]
+    return np.unique(keys, return_inverse=True)[1], sides[of] // 3
 
 
 def _vote(sides: _Sides) -> Floats:

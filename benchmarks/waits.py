@@ -75,14 +75,16 @@ def timed(folder: Path, command: str, **variables: str) -> Spent:
     """Run a command of hapticdb in a folder; what it says is in said.txt."""
     words, said, answered = command.split(), folder / "said.txt", 0.0
     env = os.environ | {"PYTHONDONTWRITEBYTECODE": ""} | variables
-    began = time.perf_counter()
+    began, until = time.perf_counter(), time.monotonic() + LONGEST_S
     with said.open("w") as out:
         line = [sys.executable, "-m", "hapticdb", *words]
         process = subprocess.Popen(line, cwd=folder, env=env, stdout=out, stderr=out)
     limit = threading.Timer(LONGEST_S, process.kill)
     limit.start()
     if words[0] in {"view", "serve"}:
-        while not (found := re.findall(r"http://\S+", said.read_text())) and limit.is_alive():
+        while (
+            not (found := re.findall(r"http://\S+", said.read_text())) and time.monotonic() < until
+        ):
             time.sleep(0.01)
         urllib.request.urlopen(found[0], timeout=LONGEST_S).close()  # noqa: S310 - http
         answered = time.perf_counter() - began

@@ -37,12 +37,21 @@ def data(name: str) -> Path | None:
     return file if file.is_file() else None
 
 
+def _git(*words: str) -> str:
+    done = subprocess.run(
+        ["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=True, timeout=GIT_S
+    )
+    return done.stdout.strip()
+
+
 def conditions() -> dict[str, Any]:
-    """What every record says first: commit, machine and versions."""
-    line = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
-    done = subprocess.run(line, capture_output=True, text=True, check=True, timeout=GIT_S)
+    """What every record says first: commit, machine and versions.
+
+    Changed results and pages alone make no commit dirty.
+    """
+    is_dirty = bool(_git("status", "--porcelain", "--", "src", "benchmarks"))
     return {
-        "commit": done.stdout.strip(),
+        "commit": _git("describe", "--always") + "-dirty" * is_dirty,
         "machine": machine(),
         "versions": {name: version(name) for name in PACKAGES},
     }

@@ -12,10 +12,12 @@ import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
+from contact_scenes import judged
 from hapticdb import Environment, PointShell
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.exact.separation import CONTACT
 from hapticdb.exact.sweep import sweep
+from hapticdb.exact.sweep_report import verdict_line
 from hapticdb.exact.swept import Swept
 from hapticdb.kernels.triangles.path_distance import MEETING
 from hapticdb.poses import rotation_of
@@ -178,6 +180,32 @@ def test_sweep_enclosed_objects(tmp_path: Path) -> None:
         assert [obj.name for obj in found.enclosed] == [name]
         assert (found.verdict, found.hits) == ("hits", ())
     assert names(out) == ["tank"]
+
+
+def holed(edge: float, missing: int) -> trimesh.Trimesh:
+    """A cube of 3,072 faces, without some of them."""
+    made = trimesh.creation.box((edge,) * 3).subdivide().subdivide().subdivide().subdivide()
+    made.update_faces(np.arange(len(made.faces)) >= missing)
+    return made
+
+
+@pytest.mark.parametrize("is_tool", [False, True])
+def test_sweep_not_watertight(tmp_path: Path, is_tool: bool) -> None:
+    """A small hole does not make free what is inside; a missing side does."""
+    small, path = trimesh.creation.box((0.01,) * 3), line((0.0, 0.0, 0.0), (0.002, 0.0, 0.0))
+    for missing, verdict in ((0, "hits"), (1, "not decided"), (512, "clear")):
+        outer = holed(CUBE, missing)
+        thing, tool = (small, outer) if is_tool else (outer, small)
+        with imported(tmp_path / f"{missing}", {"thing": thing}) as env:
+            found = sweep(env, shell_of(tool), path)
+            beside = sweep(env, shell_of(tool), line((0.1, 0.0, 0.0), (0.2, 0.0, 0.0)))
+        assert found.verdict == verdict
+        assert [obj.name for obj in found.leaky] == ["thing"] * (missing == 1)
+        said = verdict_line(found, shell_of(tool))
+        assert ("thing around the tool or inside it, and not watertight" in said) == (missing == 1)
+        assert beside.verdict == "clear"
+        kind = judged(outer.triangles * 1e3, small.triangles * 1e3).kind
+        assert kind == {"hits": "inside", "not decided": "not known", "clear": "far"}[verdict]
 
 
 # --- turns, balls, clouds ------------------------------------------------------------------------

@@ -68,6 +68,9 @@ def classify_pair(
         if separation.is_nested(pose):
             near = near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose)
             return _result(Kind.INSIDE if gap > error or not error else Kind.NOT_KNOWN, near, error)
+        if separation.is_nested(pose, is_leaky=True):
+            near = near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose)
+            return _result(Kind.NOT_KNOWN, near, error)
         if near.pairs[0, 0] < 0:
             return _result(Kind.FAR, near, error)
         if gap - error > contact:

@@ -51,6 +51,8 @@ MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
 BLOCKING = 16
 """Pairs of triangles in collision after earlier motions, tested first."""
+MOST_PIECES = 16
+"""Pieces tried in open surfaces at most: each takes a pass over their triangles."""
 
 
 class Motion(NamedTuple):
@@ -169,16 +171,23 @@ class Separation:
                 deepest = found, place
         return deepest
 
-    def is_nested(self, pose: Floats, moved: MovedPair | None = None) -> bool:
-        """Whether a piece of one surface is in a closed body of the other; they are apart."""
+    def is_nested(
+        self, pose: Floats, moved: MovedPair | None = None, *, is_leaky: bool = False
+    ) -> bool:
+        """Whether a piece of one surface is in a closed body of the other; they are apart.
+
+        is_leaky : whether it is almost enclosed by an open surface instead.
+        """
         moved = moved or self.moved(NOTHING)
         motion, own, theirs = moved.motion, moved.tool.corners, moved.object.corners
         placed = _shifted(pose, motion)
         return _contains_piece(
-            self._object, motion.object, self._tool, own, placed, is_back=False
+            self._object, motion.object, self._tool, own, placed,
+            is_back=False, is_leaky=is_leaky,
         ) or _contains_piece(
-            self._tool, motion.tool, self._object, theirs, placed, motion.growth, is_back=True
-        )
+            self._tool, motion.tool, self._object, theirs, placed, motion.growth,
+            is_back=True, is_leaky=is_leaky,
+        )  # fmt: skip
 
     def moved(self, motion: Motion, base: Motion = NOTHING, share: float = 1.0) -> MovedPair:
         """Both surfaces on the way from one motion to another."""
@@ -363,12 +372,12 @@ def _travel(first: Motion, second: Motion) -> float:
 
 def _contains_piece(
     outer: CollisionShape, outer_by: Floats | None, inner: CollisionShape, corners: Floats,
-    pose: Floats, growth: float = 0.0, *, is_back: bool,
+    pose: Floats, growth: float = 0.0, *, is_back: bool, is_leaky: bool,
 ) -> bool:  # fmt: skip
     """Whether a closed body holds a piece of a surface that is apart from it.
 
     corners (T, 3, 3) : of the inner one, placed by the pose or back; growth : of a ball's radius,
-    metres. A piece with a corner outside the body's box is not in it.
+    metres; is_leaky : as of `is_nested`. A piece with a corner outside the body's box is not in it.
     """
     reach = growth if outer_by is None else float(np.abs(outer_by).max())
     first = np.empty((len(inner.starts), 3))
@@ -381,6 +390,8 @@ def _contains_piece(
     if outer.radius:
         inside = np.linalg.norm(first[:n_in], axis=1) < outer.radius + growth
         return bool(inside.any())
+    if is_leaky:
+        return bool(outer.almost_encloses(first[: min(n_in, MOST_PIECES)]).any())
     interior = outer.moved_interior(outer_by)
     return interior is not None and bool(interior.holds(first[:n_in]).any())
 

@@ -154,6 +154,7 @@ class PathSweep:
         self._contacts: list[_Touched] = []
         self._enclosed: list[Object] = []
         self._undecided: list[Object] = []
+        self._leaky: list[Object] = []
         self._clouds: list[Object] = []
         self._error = 0.0  # chord errors where the gap was measured
 
@@ -184,6 +185,7 @@ class PathSweep:
         return Swept(
             path=self._path, gap=gap, hits=hits, touching=tuple(map(self._touched, self._contacts)),
             enclosed=tuple(self._enclosed), undecided=tuple(self._undecided),
+            leaky=tuple(self._leaky),
             contact=self._request.contact, overlap=self._request.overlap, objects=near,
             queries=self._n_queries + sum(one.pair.queries for one in self._contacts),
             revision=revision, elapsed=time.monotonic() - began,
@@ -273,9 +275,11 @@ class PathSweep:
         apart = float(gap.at_least[0])
         is_touched = gap.at_most[0] <= contact
         # at a gap of 0 no side is decided; the separating motions do that
-        is_nested = (
-            (is_inside or is_touched) and apart > SAME and Separation(shape, tool).is_nested(pose)
-        )
+        separation = Separation(shape, tool)
+        may_be_nested = (is_inside or is_touched) and apart > SAME
+        is_nested = may_be_nested and separation.is_nested(pose)
+        if may_be_nested and not is_nested and separation.is_nested(pose, is_leaky=True):
+            self._leaky.append(obj)
         if is_nested:
             (self._enclosed if apart > error else self._undecided).append(obj)
             if mover.body and apart > error:

@@ -50,6 +50,11 @@ def verdict_line(found: Swept, shell: PointShell | None) -> str:
             f"not decided: {names_of(found.undecided)} within the chord error of the triangles; "
             "import the STEP or IFC file with a finer --chord, such as 0.001"
         )
+    if found.leaky:
+        return (
+            f"not decided: {names_of(found.leaky)} around the tool or inside it, and not "
+            "watertight: close the holes of the mesh, or name what is no solid in --exclude"
+        )
     if found.verdict is PathVerdict.NOT_DECIDED:
         return (
             "not decided: the time was over before the surfaces of all objects near the path were "

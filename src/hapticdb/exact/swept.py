@@ -101,6 +101,9 @@ class Swept(Tabular):
         nothing leaves a closed body. Where the path starts.
     undecided : tuple of Object
         Objects that are met or touched by no more than the chord error of their surfaces.
+    leaky : tuple of Object
+        Objects inside the tool, or around it where the path starts, of which one surface is not
+        watertight, but leaves out less than 1 % of the directions.
     contact, overlap : float
         The contact tolerance, and the overlap that is allowed at the start; metres.
     objects : int
@@ -129,6 +132,7 @@ class Swept(Tabular):
     touching: tuple[TouchedObject, ...]
     enclosed: tuple[Object, ...]
     undecided: tuple[Object, ...]
+    leaky: tuple[Object, ...]
     contact: float
     overlap: float
     objects: int
@@ -174,7 +178,7 @@ class Swept(Tabular):
         """
         if self.hits or self.enclosed:
             return PathVerdict.HITS
-        if self.is_stopped or self.undecided:
+        if self.is_stopped or self.undecided or self.leaky:
             return PathVerdict.NOT_DECIDED
         if self.overlapping:
             return PathVerdict.OVERLAPS

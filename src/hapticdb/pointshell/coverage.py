@@ -32,6 +32,22 @@ def halves(triangles: Floats) -> Floats:
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
 
 
+def winding_numbers(triangles: Floats, positions: Floats) -> Floats:
+    """Winding numbers (Q,) of triangles (F, 3, 3), by their corners' order, at positions (Q, 3).
+
+    Solid angles by Van Oosterom and Strackee, 1983.
+    """
+    found = np.zeros(len(positions))
+    for n, place in enumerate(positions):
+        corners = (triangles - place).swapaxes(0, 1)
+        lengths = np.linalg.norm(corners, axis=2)
+        dots = np.einsum("kfi,kfi->kf", corners, np.roll(corners, -1, axis=0))
+        volumes = np.einsum("fi,fi->f", corners[0], np.cross(corners[1], corners[2]))
+        shares = lengths.prod(axis=0) + (dots * np.roll(lengths, 1, axis=0)).sum(axis=0)
+        found[n] = np.arctan2(volumes, shares).sum() / (2.0 * np.pi)
+    return found
+
+
 class Ball(NamedTuple):
     """A sphere about the origin; radius in metres."""
 

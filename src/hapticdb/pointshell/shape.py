@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 from hapticdb.kernels.surfaces.triangle_bvh import TriangleBVH, normals_of, triangle_bvh
 from hapticdb.kernels.triangles.offsets import FLAT
-from hapticdb.pointshell.coverage import Interior
+from hapticdb.pointshell.coverage import Interior, winding_numbers
 from hapticdb.pointshell.orientation import Surface, components, faces_of, orient
 
 Floats = NDArray[np.float64]
@@ -18,6 +18,9 @@ FLATS, PARALLEL = 3, 0.999
 """Flat faces whose normals are axes, and the cosine from which two of them are parallel."""
 ALIKE, CELLS = 1e-3, np.array([1, 1 << 12, 1 << 24])
 """Length of cells of normals that are those of one face, and the steps of their numbers."""
+LEAK = 0.01
+"""Share of the directions that may lead out of an open surface around a place. Larger: boxes that
+lack a lid count."""
 ASKEW = np.array([0.62, 0.54, 0.57])
 """Vector in no likely plane: it chooses one of two opposite normals."""
 
@@ -61,6 +64,26 @@ class CollisionShape:
     def interior(self) -> Interior | None:
         """Its inside; None where it has no closed body."""
         return (Interior(self._oriented[0]) or None) if self._oriented else None
+
+    def almost_encloses(self, positions: Floats) -> NDArray[np.bool_]:
+        """Whether its open surfaces, not watertight, go round positions (Q, 3): (Q,).
+
+        By winding numbers near to a whole one: a measurement, no proof.
+        """
+        turns = winding_numbers(self._open, positions)
+        return np.asarray((np.abs(turns) > 0.5) & (np.abs(turns - np.rint(turns)) < LEAK))
+
+    @cached_property
+    def _open(self) -> Floats:
+        """Triangles (F, 3, 3) of its open surfaces, of one winding inwards."""
+        if self._oriented is None:
+            return self.tree.corners[:0]
+        surface = self._oriented[0]
+        is_open = surface.bodies == 0
+        found, inward = surface.triangles[is_open], surface.normals[is_open]
+        is_outward = (normals_of(found)[0] * inward).sum(axis=1) < 0.0
+        found[is_outward] = found[is_outward, ::-1]
+        return np.asarray(found)
 
     def moved_interior(self, by: Floats | None) -> Interior | None:
         """The inside after the tree's corners have moved by (T, 3, 3) metres, if they have."""

@@ -32,7 +32,7 @@ FIELDS = {
     "Replayed": "is_equal frames=n_frames differing=n_differing revision parting",
     "Swept": (
         "verdict gap=gap.at_least gap_at_most=gap.at_most chord_error=gap.error nearest=gap.place "
-        "comes_out hits touching enclosed undecided contact overlap objects queries revision "
+        "comes_out hits touching enclosed undecided leaky contact overlap objects queries revision "
         "elapsed is_stopped length=path.length notes clouds cloud_radius"
     ),
     "TargetReach": "object verdict n_free n_angles free gap obstacles pose",

@@ -180,6 +180,8 @@ def main() -> None:
     if asked.prepare:
         prepare(asked.prepare)
         return
+    # shells ignore it in what they start in the background, and children inherit that
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sides = {"this": records.ROOT} | ({"old": asked.old.resolve()} if asked.old else {})
     with tempfile.TemporaryDirectory(prefix="hapticdb-waits-") as folder:
         cells = measure(Path(folder), sides, asked.rounds, COMMANDS)

@@ -19,7 +19,7 @@ from paper.cells import (
 LAWS = ("plane", "distance")
 COMPARED = ("points", "statement", "array", "maxgap", "cbgroup")
 """Strategies of the claim, in the order of its columns."""
-SHOWN = (1, 8, 32)
+SHOWN = (1, 32)
 """Numbers of readers in the table; the plot has all."""
 PULLED = {0: "come out", 4: "leave an overlap", 1: "are blocked", 3: "not decided"}
 """Answers of `extract` by straight pulls, by its exit codes."""
@@ -101,20 +101,19 @@ def visits(results: Results) -> str:
     engines = distinct([cell for cell in cells if "visit" in cell], "engine")
     for (where, poses), group in grouped(cells, ("environment", "poses")).items():
         us = {(c["engine"], c["law"], c.get("visit", c["strategy"])): typical(c) for c in group}
-        bitmap = typical(_bitmap_beside(cells, group[0]))
+        bitmap = us_text(typical(_bitmap_beside(cells, group[0])))
         for law in LAWS:
-            row = [f"{where}, {poses}, {law}", us_text(bitmap)]
+            row = [f"{where}, {poses}, {law}", bitmap]
             for engine in engines:
-                times = [us[engine, law, one] for one in ("points", "first", "again")]
-                row += [*map(us_text, times), us_text(times[-1] / bitmap)]
+                row += [us_text(us[engine, law, one]) for one in ("points", "first", "again")]
             rows.append(row)
     beside = [f"{one}: points" for one in engines]
-    head = [text for name in beside for text in (name, "first", "again", "/ bitmap")]
+    head = [text for name in beside for text in (name, "first", "again")]
     return table(["us a frame", "bitmap", *head], rows)
 
 
 def table_1(results: Results) -> str:
-    """Voxels, objects and cells of the data space."""
+    """Objects, triangles and voxels."""
     return listed(
         cells_of(results, "costs"),
         {
@@ -122,7 +121,6 @@ def table_1(results: Results) -> str:
             "objects": lambda cell: f"{cell['objects']:,}",
             "triangles": lambda cell: f"{cell['triangles']:,}",
             "object voxels": lambda cell: f"{cell['object_voxels']:,}",
-            "cells of the data space": lambda cell: f"{8 ** cell['bits']:.2g}",
         },
     )
 
@@ -131,30 +129,23 @@ def costs(results: Results) -> str:
     """What an import takes, without and with distances."""
     rows = []
     for cell in cells_of(results, "costs"):
-        millions = cell["object_voxels"] / 1e6
-        for name, words in (("plain", "without"), ("distance", "with")):
-            one = cell[name]
-            rows.append([
-                f"{cell['environment']}, {words} distances",
-                f"{one['bytes'] / cell['object_voxels']:.2f}",
-                us_text(one["s"]),
-                us_text(one["s"] / millions),
-                us_text(1e6 * one["s"] / cell["triangles"]),
-                f"{one['peak_mb']:,.0f}",
-            ])  # fmt: skip
-    head = ["import of the", "bytes a voxel", "s", "s a million voxels", "s a million triangles"]
-    return table([*head, "peak, MB"], rows)
+        voxels, row = cell["object_voxels"], [cell["environment"]]
+        for one in (cell["plain"], cell["distance"]):
+            row += [f"{one['bytes'] / voxels:.2f}", us_text(one["s"])]
+            row += [us_text(1e6 * one["s"] / voxels), f"{one['peak_mb']:,.0f}"]
+        rows.append(row)
+    head = ["bytes a voxel", "s", "s a million voxels", "peak, MB"]
+    return table(["", *head, *(f"with distances: {head[0]}", *head[1:])], rows)
 
 
 def waits(results: Results) -> str:
-    """Seconds of each verb, first and again; processor time and memory of the latter."""
+    """Seconds of each verb, first and again; memory of the latter."""
     return listed(
         [cell for cell in cells_of(results, "waits") if cell["side"] == "this"],
         {
             "verb": lambda cell: f"`{cell['command'].split()[0]}`",
-            "first, s": lambda cell: f"{cell['first']['s']:.2f}",
-            "again, s": lambda cell: f"{cell['again']['s']:.2f}",
-            "processor, s": lambda cell: f"{cell['again']['cpu_s']:.2f}",
+            "first, s": lambda cell: us_text(cell["first"]["s"]),
+            "again, s": lambda cell: us_text(cell["again"]["s"]),
             "MB": lambda cell: f"{cell['again']['peak_mb']:,.0f}",
         },
     )

@@ -99,8 +99,11 @@ def test_interior_t_junctions(off: float, is_solid: bool) -> None:
         middle = a + rng.uniform(0.2, 0.8) * (b - a) + off * CRACK * np.sqrt(3.0) * (c - b)
         triangles += [np.array([a, middle, c]), np.array([middle, b, c])]
     turned = np.array(triangles) @ Rotation.random(random_state=rng).as_matrix().T
-    interior = Interior(orient(turned))
-    assert bool(interior) == is_solid
+    backwards = rng.random(len(turned)) < 0.5
+    turned[backwards] = turned[backwards, ::-1]
+    surface = orient(turned)
+    interior = Interior(surface)
+    assert (bool(interior), surface.is_closed) == (is_solid, is_solid)
     places = rng.uniform(-0.28, 0.28, (50, 3))
     assert (interior.holds(places) == is_solid).all()
     assert not interior.holds(places + 2.0).any()

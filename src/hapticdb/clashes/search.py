@@ -163,7 +163,7 @@ class PairQuery(NamedTuple):
     @property
     def setting(self) -> str:
         """Dependencies of a row, apart from its objects."""
-        return f"within {self.within!r} contact {self.contact!r} by motions"
+        return f"within {self.within!r} contact {self.contact!r} by motions, holes"
 
 
 class PairSearch:

@@ -151,7 +151,7 @@ def _link_pairs(
     rows = len(path.poses) - 1
     parts = max(STRETCHES // rows, 1)
     given, least = np.arange(rows + 1), dict.fromkeys(pairs, np.inf)
-    for first in range(0, rows, AT_ONCE):
+    for first in range(0, rows if pairs else 0, AT_ONCE):
         some = slice(first, first + AT_ONCE)
         middles = first + (np.arange(parts * len(given[:-1][some])) + 0.5) / parts
         values = np.stack([np.interp(middles, given, one) for one in path.poses.T], axis=1)

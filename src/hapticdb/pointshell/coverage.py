@@ -79,7 +79,7 @@ class Interior:
     def moved(self, by: Floats) -> "Interior":
         """The inside after a motion of the triangles' corners by (F, 3, 3) metres.
 
-        Bodies stay closed under any motion.
+        Bodies stay closed under any motion, but for cracks at T-junctions, up to the motion.
         """
         found, reach = copy(self), float(np.abs(by).max(initial=0.0))
         solid, larger = self.solid, np.array([[-reach], [reach]])

@@ -20,6 +20,8 @@ A larger value closes wider gaps, and also joins the corners of small details.""
 CRACK = 1e-5
 """Distance up to which a corner lies on an open edge, likewise: of a part of a metre, 0.01 mm, the
 tolerance of sweeps. A larger value encloses more, and overlooks wider cracks."""
+MOST_NEAR = 10_000_000
+"""Corners tried on open edges, at most: half a gigabyte. Beyond, edges stay open."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -95,7 +97,7 @@ def orient(triangles: Floats, faces: Ints | None = None) -> Surface:
 
 
 def _sides_of(faces: Ints, triangles: Floats) -> tuple[_Sides, bool]:
-    """Sides of the triangles (F, 3, 3), and whether no edge of their faces (F, 3) is open."""
+    """Sides of the triangles (F, 3, 3), and whether all bodies are closed."""
     normals, areas = kernels.normals_of(triangles)
     if not 0.0 < float(areas.sum()) < np.inf:
         raise UsageError("its triangles have no area, or more than can be counted")
@@ -104,7 +106,7 @@ def _sides_of(faces: Ints, triangles: Floats) -> tuple[_Sides, bool]:
     normals[is_flipped] *= -1.0
     body = _bodies(faces, edges, triangles)
     sides = _Sides(triangles, triangles.mean(axis=1), normals, areas, patch, body, is_flipped)
-    return sides, not bool((edges.uses % 2).any())
+    return sides, bool(body.all())
 
 
 def _are_within(sides: _Sides, faces: Ints, walls: Ints, triangles: Floats) -> NDArray[np.bool_]:
@@ -284,14 +286,18 @@ def _cut(faces: Ints, sides: Ints, triangles: Floats) -> tuple[Ints, Ints]:
         one.reshape(-1, 3)[sides] for one in (triangles, np.roll(triangles, -1, axis=1))
     )
     tails, heads = (one.ravel()[sides] for one in (faces, np.roll(faces, -1, axis=1)))
-    loose, first = np.unique(tails, return_index=True)
+    # tails and heads: a corner may be no side's tail under another winding
+    loose, first = np.unique(np.append(tails, heads), return_index=True)
+    places = np.append(begins, ends, axis=0)[first]
     along = ends - begins
     squares = np.maximum((along**2).sum(axis=1), np.finfo(np.float64).tiny)
-    tree = cKDTree(begins[first])
-    near = tree.query_ball_point(0.5 * (begins + ends), 0.5 * np.sqrt(squares))
+    tree, balls = cKDTree(places), (0.5 * (begins + ends), 0.5 * np.sqrt(squares))
+    if tree.query_ball_point(*balls, return_length=True).sum() > MOST_NEAR:
+        return np.arange(len(sides)), sides // 3
+    near = tree.query_ball_point(*balls)
     side = np.repeat(np.arange(len(sides)), [len(some) for some in near])
     corner = np.concatenate(near).astype(np.int64)
-    arms = begins[first[corner]] - begins[side]
+    arms = places[corner] - begins[side]
     shares = (arms * along[side]).sum(axis=1) / squares[side]
     off = np.linalg.norm(arms - shares[:, None] * along[side], axis=1)
     is_on = off <= CRACK * float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))

@@ -201,7 +201,7 @@ class Header:
                     str(made["link"]),
                     index(made["seed"]),
                 ),
-                law=law_named(given["law"], given["stiffness"]),
+                law=law_named(given["law"], float(given["stiffness"])),
                 rendering="coupled" if given["rendering"] == "coupled" else "direct",
                 start=Start(*start),
             )

@@ -88,7 +88,7 @@ class _Output(Output):
             return
         if not self.animation.lower().endswith(".html"):
             raise UsageError(f"--animation {self.animation}: give a name that ends in .html")
-        if importlib.util.find_spec("viser") is None:
+        if None in map(importlib.util.find_spec, ("viser", "embreex")):
             raise MissingExtraError(f"an animation needs more packages: {pip_line('view')}")
 
     def files(self, n_steps: int | None) -> list[str]:

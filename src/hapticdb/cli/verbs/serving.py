@@ -153,7 +153,7 @@ def serve(
 def _check_extra() -> None:
     from importlib.util import find_spec
 
-    missing = [name for name in ("viser", "starlette", "uvicorn", "prometheus_client")
+    missing = [name for name in ("viser", "embreex", "starlette", "uvicorn", "prometheus_client")
                if find_spec(name) is None]  # fmt: skip
     if missing:
         raise MissingExtraError(f"the browser view needs {', '.join(missing)}: {pip_line('view')}")

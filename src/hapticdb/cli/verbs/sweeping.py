@@ -162,31 +162,28 @@ def sweep(
     if batch is not None or not stored.envelope:
         refuse("with --batch, or without a name for --envelope", stored)
     requests = [one] if batch is None else read_sweeps(batch, one)
-    with (
-        open_csv(output.csv, SWEPT_KEYS) as table,
-        ExitStack() as curves,
-        hapticdb.open(url, read_only=not stored.envelope) as env,
-    ):
-        files = [Path(file) for file in motion.gaps or ()]
-        adds = [curves.enter_context(open_table(file, "--gaps", plot=gap_plot)) for file in files]
-        exclude += stored.former(env)
-        if machine.machine is None:
-            jobs = [_job(env, each, motion.path_unit) for each in requests]
-            findings = _all_told((_swept(env, job, motion, stored) for job in jobs), output)
-        else:
-            findings = _all_told([_machine_swept(env, one, machine, motion, stored)], output)
-        if table:
-            table.add(*findings[0].found.records())
-        if gaps := findings[0].found.gaps:
-            for add in adds:
-                add(gaps.columns())
-            if gaps.is_stopped:
-                render.note("--gaps: the time was over, pairs are missing: give more --seconds")
+    with hapticdb.open(url, read_only=not stored.envelope) as env:
+        with open_csv(output.csv, SWEPT_KEYS) as table, ExitStack() as curves:
+            files = map(Path, motion.gaps or ())
+            adds = [curves.enter_context(open_table(one, "--gaps", plot=gap_plot)) for one in files]
+            exclude += stored.former(env)
+            if machine.machine is None:
+                jobs = [_job(env, each, motion.path_unit) for each in requests]
+                findings = _all_told((_swept(env, job, motion, stored) for job in jobs), output)
+            else:
+                findings = _all_told([_machine_swept(env, one, machine, motion, stored)], output)
+            if table:
+                table.add(*findings[0].found.records())
+            if gaps := findings[0].found.gaps:
+                for add in adds:
+                    add(gaps.columns())
+                if gaps.is_stopped:
+                    render.note("--gaps: the time was over, pairs are missing: give more --seconds")
         if batch is None and output.has_words:
             _show(findings[0])
         elif output.has_words:
             _show_batch(findings)
-        if made := findings[0].envelope:
+        if made := findings[0].envelope:  # after the files: what fails here leaves them
             env.add(made, replace=stored.replace)
             render.note(f"envelope stored as {made.name}, in voxels of {made.attributes['voxel']}")
     codes = {one.found.verdict.exit_status for one in findings}

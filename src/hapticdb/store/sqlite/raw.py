@@ -50,12 +50,15 @@ def forget_pages(path: Path) -> None:
     """Drop the operating system's cached pages of a database opened by this process."""
     status = path.stat()
     for descriptor in map(int, os.listdir("/proc/self/fd")):  # noqa: PTH208 - numbers
-        with contextlib.suppress(OSError):  # closed since it was listed
-            if os.path.samestat(os.fstat(descriptor), status):
-                # first: pages that are not yet on disk cannot be dropped
-                os.fsync(descriptor)
-                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
-                return
+        try:
+            is_it = os.path.samestat(os.fstat(descriptor), status)
+        except OSError:  # closed since it was listed
+            continue
+        if is_it:
+            # first: pages that are not yet on disk cannot be dropped
+            os.fsync(descriptor)
+            os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+            return
 
 
 def sync_folder(path: Path) -> None:

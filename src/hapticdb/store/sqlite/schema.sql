@@ -115,7 +115,7 @@ CREATE TABLE pair (
   b_z      REAL NOT NULL,
   status   TEXT NOT NULL,     -- new, gone, changed or same since the search before
   revision INTEGER NOT NULL,  -- of the environment that was searched
-  setting  TEXT NOT NULL,     -- lengths of the search: within 0.001 contact 5e-05 by motions
+  setting  TEXT NOT NULL,     -- lengths of the search: within 0.001 contact 5e-05 by motions, holes
   because  TEXT,              -- why the pair is accepted; NULL if it is not
   shapes   TEXT,              -- both digests when it was accepted, a blank between
   PRIMARY KEY (a, b)

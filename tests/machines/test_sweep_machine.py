@@ -199,6 +199,20 @@ def test_sweep_machine_link_inside_body_is_hit(env: Environment, tmp_path: Path)
     assert found.hits[0].body == "arm"
 
 
+def test_sweep_machine_link_hits_its_base(env: Environment, tmp_path: Path) -> None:
+    machine = machine_of(
+        tmp_path, link("foot", box("0.4 0.2 0.2")), link("slider", box("0.1 0.1 0.1")),
+        joint("slide", "foot slider", "prismatic", "1 0 0", "1 0 0"),
+    )  # fmt: skip
+    base = np.eye(4)
+    base[1, 3] = 40.0
+    free = sweep_machine(env, machine, [[0.0], [0.5], [-0.7], [0.2]], at=base)
+    assert free.gap.at_least <= 0.05 <= free.gap.at_most
+    hit = sweep_machine(env, machine, [[0.0], [0.5], [-1.0]], at=base)
+    assert [(place.body, place.object.name) for place in hit.hits] == [("slider", "foot")]
+    assert hit.hits[0].fraction == pytest.approx((0.5 + 1.25) / 2.0, abs=1e-4)
+
+
 @pytest.mark.parametrize("overlap", [0.0, 1e-3])
 def test_sweep_machine_base_on_floor(env: Environment, tmp_path: Path, overlap: float) -> None:
     machine = machine_of(

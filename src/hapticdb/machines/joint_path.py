@@ -142,7 +142,7 @@ def joint_path(
     for first in range(0, len(values) - 1, AT_ONCE):
         some = values[first : first + AT_ONCE + 1]
         placed = machine.all_placed(some)
-        for pair in in_time(pairs, until):
+        for pair in in_time(pieces, until):  # each once: the scene's are also the base's
             with np.errstate(over="ignore", invalid="ignore"):
                 speed, bend, turn = motion_bounds(machine, some, *pair, placed)
                 # chord error h^2 / 8 times the second derivative, solved for the number of parts

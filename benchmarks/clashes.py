@@ -105,7 +105,7 @@ def measured(what: str, url: str) -> dict[str, Any]:
         "cpu_s": ended - began,
         "s": over - wall,
         "list_cpu_s": listed - ended,
-        "peak_mb": int(PEAK.findall(Path("/proc/self/status").read_text())[0]) / 1e3,
+        "peak_mb": int(PEAK.findall(Path("/proc/self/status").read_text())[0]) * 1.024e-3,
     }
 
 

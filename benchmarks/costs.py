@@ -53,7 +53,7 @@ def imported(url: str, file: str, bits: int, extent: float, distances: int) -> d
     return {
         "s": time.perf_counter() - began,
         "cpu_s": time.process_time() - busy,
-        "peak_mb": int(PEAK.findall(Path("/proc/self/status").read_text())[0]) / 1e3,
+        "peak_mb": int(PEAK.findall(Path("/proc/self/status").read_text())[0]) * 1.024e-3,
     }
 
 

@@ -114,8 +114,8 @@ def main() -> None:
         print(row, flush=True)
     inputs = {"bits": BITS, "aside_m": ASIDE}
     found = records.conditions() | {"inputs": inputs, "rows": rows}
-    records.write(Path("results"), {"fits": found})
-    page_tables.refill("docs/paths.md", Path("results"))
+    records.write(records.ROOT / "results", {"fits": found})
+    page_tables.refill("docs/paths.md", records.ROOT / "results")
 
 
 if __name__ == "__main__":

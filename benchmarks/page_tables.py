@@ -190,14 +190,12 @@ def fits(results: Results) -> str:
 
 def truth(results: Results) -> str:
     """Answers beside oracles; gaps below theirs in um."""
-    head = ("what", "oracle", "cases", "false clear", "false hit", "undecided", "gap below, um")
-    names = ("what", "oracle", "cases", "wrong_clear", "wrong_hit", "undecided")
+    head = ("what, by what", "clear", "false", "hit", "false", "undecided", "gap below, um")
+    names = ("said_clear", "wrong_clear", "said_hit", "wrong_hit", "undecided")
     rows = []
     for row in results["truth"]["rows"]:
-        below, hits = row["gap_below_m"], f", {row.get('said_hit')} collide"
-        told = [f"{row[name]}" for name in names]
-        told[0] += hits if "OMPL" in told[0] else ""
-        rows.append([*told, us_text(below and 1e6 * below)])
+        told, below = [f"{row[name]:,}" for name in names], row["gap_below_m"]
+        rows.append([f"{row['what']}: {row['oracle']}", *told, us_text(below and 1e6 * below)])
     return table(head, rows)
 
 
@@ -245,15 +243,24 @@ def tables() -> dict[str, Callable[[Results], str]]:
 
 def filled(text: str, results: Results) -> str:
     """The text of a page with its tables made anew; a table whose results are missing is left."""
-    made = tables()
+    made, measured = tables(), _Measured(results)
 
     def anew(mark: re.Match[str]) -> str:
         try:
-            return f"{mark[1]}{made[mark[2]](results)}\n"
-        except KeyError:
+            return f"{mark[1]}{made[mark[2]](measured)}\n"
+        except NotMeasuredError:
             return mark[0]
 
     return MARK.sub(anew, text)
+
+
+class NotMeasuredError(Exception):
+    """An experiment is missing."""
+
+
+class _Measured(dict[str, Result]):
+    def __missing__(self, name: str) -> Result:
+        raise NotMeasuredError(name)
 
 
 def refill(page: str, folder: Path, out: Path | None = None) -> None:

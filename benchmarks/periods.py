@@ -36,29 +36,19 @@ NAMES = ("late p50", "late p99", "late p99.9", "took p50", "took p99", "took p99
 def plate(file: Path) -> None:
     """Import a plate whose top is at z = 0."""
     mesh = file.with_suffix(".stl")
-    box = trimesh.creation.box((0.2, 0.2, 0.02))
-    box.apply_translation((0.0, 0.0, -0.01))
-    box.export(mesh)
+    trimesh.creation.box(bounds=[(-0.1, -0.1, -0.02), (0.1, 0.1, 0.0)]).export(mesh)
     grid = hapticdb.GridOptions(voxel_size=VOXEL, bits=7)
     (report,) = hapticdb.import_files(str(file), [mesh], hapticdb.ImportOptions(grid=grid))
     if report.error is not None:
         raise report.error
 
 
-def ball(n_points: int) -> hapticdb.PointShell:
-    """Evenly spread points of a ball."""
-    n = np.arange(n_points) + 0.5
-    angle, z = np.pi * (1.0 + 5.0**0.5) * n, 1.0 - 2.0 * n / n_points
-    r = np.sqrt(1.0 - z * z)
-    out = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
-    return hapticdb.PointShell(RADIUS * out, -out, np.zeros(3))
-
-
 def measured(file: str, n_slots: int, rate: float) -> list[float]:
     """Figures of one turn, us, in the order of NAMES."""
     with SessionHost(file, rate=rate) as host:
         begin = translation_matrix((0.0, 0.0, 0.03))
-        sessions = [host.begin(ball(POINTS), begin) for _ in range(n_slots)]
+        ball = hapticdb.PointShell.sphere(RADIUS, POINTS)
+        sessions = [host.begin(ball, begin) for _ in range(n_slots)]
         end = time.monotonic() + SECONDS
         while (left := end - time.monotonic()) > 0.0:
             for n, session in enumerate(sessions):
@@ -66,6 +56,9 @@ def measured(file: str, n_slots: int, rate: float) -> list[float]:
                 session.move(translation_matrix((0.0, 0.0, z)))
             time.sleep(1.0 / MOVES_PER_SECOND)
         found = [session.figures() for session in sessions]
+        counts = [session.counts() for session in sessions]
+        shares = [c["contact_frames"] / f.frames for c, f in zip(counts, found, strict=True)]
+        assert min(shares) > 0.1, shares
     spreads: list[Any] = [[figures.lateness for figures in found], [f.elapsed for f in found]]
     return [
         1e6 * value

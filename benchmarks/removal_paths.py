@@ -156,8 +156,8 @@ def main() -> None:
     argparse.ArgumentParser(description=records.first_line(__doc__)).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         found = {"removal_paths": measure(Path(folder), None, BITS, SAMPLE)}
-    records.write(Path("results"), found)
-    page_tables.refill("docs/paths.md", Path("results"))
+    records.write(records.ROOT / "results", found)
+    page_tables.refill("docs/paths.md", records.ROOT / "results")
 
 
 if __name__ == "__main__":

@@ -195,7 +195,9 @@ def truth(results: Results) -> str:
     rows = []
     for row in results["truth"]["rows"]:
         told, below = [f"{row[name]:,}" for name in names], row["gap_below_m"]
-        rows.append([f"{row['what']}: {row['oracle']}", *told, us_text(below and 1e6 * below)])
+        took = f", {us_text(row['s'])} s" * ("CCD" in row["what"])
+        what = f"{row['what']}: {row['oracle']}{took}"
+        rows.append([what, *told, us_text(below and 1e6 * below)])
     return table(head, rows)
 
 

@@ -56,6 +56,7 @@ def swept(path: ToolPath | None = None, **changed: Any) -> Swept:  # noqa: ANN40
         "touching": (),
         "enclosed": (),
         "undecided": (),
+        "leaky": (),
         "contact": 5e-5,
         "overlap": 0.0,
         "objects": 3,

@@ -45,6 +45,8 @@ DEEP = HIT._replace(at_least=2e-3)
          "leaves seat and hits it again at 80 % of the path"),
         (swept(enclosed=(thing("tank", 4, 1.0), thing("pea", 5, 1e-3)), hits=(HIT,)), "hits",
          "lies inside tank; pea lies inside the tool; hits seat at 25 % of the path"),
+        (swept(leaky=(SEAT, LID)), "not decided",
+         "not decided: seat, lid around the tool or inside it, and not watertight"),
     ],
 )  # fmt: skip
 def test_verdict_line_cases(found: Swept, verdict: str, told: str) -> None:

@@ -208,6 +208,41 @@ def test_sweep_not_watertight(tmp_path: Path, is_tool: bool) -> None:
         assert kind == {"hits": "inside", "not decided": "not known", "clear": "far"}[verdict]
 
 
+@pytest.mark.parametrize("gap", [1e-6, 0.0, -2e-5])
+def test_sweep_resting_in_not_watertight(tmp_path: Path, gap: float) -> None:
+    """A part on the inner floor is inside; one on the roof, or in a box without a lid, is not."""
+    edge = 0.01
+    floor, roof = -0.5 * CUBE + 0.5 * edge + gap, 0.5 * CUBE + 0.5 * edge + gap
+    part = trimesh.creation.box((edge,) * 3)
+    for missing, z, verdict in (
+        (1, floor, "not decided"), (1, roof, "clear"), (512, floor, "clear")
+    ):  # fmt: skip
+        outer = holed(CUBE, missing)
+        with imported(tmp_path / f"{missing} {z}", {"thing": outer}) as env:
+            found = sweep(env, shell_of(part), line((0.0, 0.0, z), (0.0, 0.0, z + 0.005)))
+        assert found.verdict == verdict
+        placed = part.triangles + np.array([0.0, 0.0, z])
+        kind = judged(outer.triangles * 1e3, placed * 1e3).kind
+        assert kind == ("not known" if verdict == "not decided" else "touching")
+
+
+def test_shape_almost_encloses_by_one_part_or_all() -> None:
+    """Sheets beside a holed body in one part, or pieces beside its hole, do not hide it."""
+    outer, small = np.array(holed(CUBE, 1).triangles), trimesh.creation.box((0.004,) * 3).triangles
+    sheet = np.array([[(-1, -1, 0), (1, -1, 0), (1, 1, 0)]]) * 0.1 + (0.0, 0.0, 0.05)
+    places = np.array(
+        [(x, y, 0.018) for x in (-0.017, 0.017) for y in np.linspace(-0.017, 0.017, 12)]
+    )
+    aside = [small + place for place in places]
+    halves = np.split(outer[np.argsort(outer[:, :, 2].mean(axis=1))], [1500])
+    for thing, tool in (
+        (np.concatenate([outer, sheet]), small),
+        (outer, np.concatenate([*aside, small])),
+        (np.concatenate([halves[0], halves[1] + (0.0, 0.0, 1e-5)]), small),
+    ):
+        assert judged(thing * 1e3, tool * 1e3).kind == "not known"
+
+
 # --- turns, balls, clouds ------------------------------------------------------------------------
 
 

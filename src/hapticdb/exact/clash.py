@@ -82,7 +82,7 @@ def classify_pair(
     separation.note_nearest(pose, near.pairs)
     # freed by less: the true surfaces touch, too; freed by more alone: they may
     freed = _freed(separation, pose, contact - error)
-    if freed == Kind.TOUCHING or (freed == Kind.INSIDE and not error):
+    if freed in (Kind.TOUCHING, Kind.NOT_KNOWN) or (freed == Kind.INSIDE and not error):
         return _result(freed, near, error)
     if error and _freed(separation, pose, contact + error) == Kind.TOUCHING:
         return _result(Kind.NOT_KNOWN, near, error)
@@ -92,15 +92,19 @@ def classify_pair(
 def _freed(separation: Separation, pose: Floats, reach: float) -> Kind | None:
     """Kind of surfaces that meet and are freed by a motion of a reach; None without one.
 
-    Inside, if each such motion leaves a piece of one in a closed body of the other.
+    Inside, if each such motion leaves a piece of one in a closed body of the other; not known, if
+    in an open surface that almost encloses it.
     """
     found: Kind | None = None
     if reach <= 0.0:
         return found
     for moved in separation.separating(pose, reach, TINY, gap=0.0, any_side=True):
-        if not separation.is_nested(pose, moved):
+        if separation.is_nested(pose, moved):
+            found = found or Kind.INSIDE
+        elif separation.is_nested(pose, moved, is_leaky=True):
+            found = Kind.NOT_KNOWN
+        else:
             return Kind.TOUCHING
-        found = Kind.INSIDE
     return found
 
 

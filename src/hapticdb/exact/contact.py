@@ -116,6 +116,14 @@ class Contact:
                 return next(self._motions, least)
         return first
 
+    def is_leaky(self) -> bool:
+        """Whether all that frees coinciding surfaces leaves one in an open one, almost enclosed."""
+        pose, found = self._pair.path.at([0.0])[0], self._separation
+        if self._moved is None:
+            return False
+        some = chain([self._moved], found.separating(pose, self.reach, CLEARANCE, gap=0.0))
+        return all(found.is_nested(pose, one, is_leaky=True) for one in some)
+
     @property
     def is_sliding(self) -> bool:
         """Whether the tool moves on while it touches."""

@@ -51,8 +51,9 @@ MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
 BLOCKING = 16
 """Pairs of triangles in collision after earlier motions, tested first."""
-MOST_PIECES = 16
-"""Pieces tried in open surfaces at most: each takes a pass over their triangles."""
+MOST_PIECES, PASSES = 16, 2_000_000
+"""Pieces tried in open surfaces at most, or more where they have few triangles, up to so many
+passes over one triangle: half a second."""
 
 
 class Motion(NamedTuple):
@@ -391,7 +392,9 @@ def _contains_piece(
         inside = np.linalg.norm(first[:n_in], axis=1) < outer.radius + growth
         return bool(inside.any())
     if is_leaky:
-        return bool(outer.almost_encloses(first[: min(n_in, MOST_PIECES)]).any())
+        most = max(MOST_PIECES, PASSES // len(outer.tree.corners))
+        some = np.linspace(0, n_in - 1, min(n_in, most)).astype(np.int64)
+        return bool(outer.almost_encloses(first[some], outer_by).any())
     interior = outer.moved_interior(outer_by)
     return interior is not None and bool(interior.holds(first[:n_in]).any())
 

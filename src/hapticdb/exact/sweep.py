@@ -300,6 +300,8 @@ class PathSweep:
         found = self._contact(pair, shape, gap, pair.error if is_fine else -pair.error)
         if not is_fine:
             self._undecided.append(obj)
+        if gap <= SAME and found.is_leaky():
+            self._leaky.append(obj)
         self._contacts.append(_Touched(mover, obj, pair, shape, gap, found))
         if found.is_hit:
             self._note_hit(len(self._contacts) - 1)

@@ -32,19 +32,21 @@ def halves(triangles: Floats) -> Floats:
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
 
 
-def winding_numbers(triangles: Floats, positions: Floats) -> Floats:
-    """Winding numbers (Q,) of triangles (F, 3, 3), by their corners' order, at positions (Q, 3).
+def winding_numbers(triangles: Floats, parts: NDArray[np.int64], positions: Floats) -> Floats:
+    """Winding numbers (Q, P) of each part of triangles (F, 3, 3), at positions (Q, 3).
 
-    Solid angles by Van Oosterom and Strackee, 1983.
+    By their corners' order; parts (F,) : of each triangle, 0, 1, ... Solid angles by Van Oosterom
+    and Strackee, 1983.
     """
-    found = np.zeros(len(positions))
+    found = np.zeros((len(positions), int(parts.max(initial=-1)) + 1))
     for n, place in enumerate(positions):
         corners = (triangles - place).swapaxes(0, 1)
         lengths = np.linalg.norm(corners, axis=2)
         dots = np.einsum("kfi,kfi->kf", corners, np.roll(corners, -1, axis=0))
         volumes = np.einsum("fi,fi->f", corners[0], np.cross(corners[1], corners[2]))
         shares = lengths.prod(axis=0) + (dots * np.roll(lengths, 1, axis=0)).sum(axis=0)
-        found[n] = np.arctan2(volumes, shares).sum() / (2.0 * np.pi)
+        turns = np.arctan2(volumes, shares) / (2.0 * np.pi)
+        found[n] = np.bincount(parts, turns, found.shape[1])
     return found
 
 

@@ -22,6 +22,8 @@ CRACK = 1e-5
 tolerance of sweeps. A larger value encloses more, and overlooks wider cracks."""
 MOST_NEAR = 10_000_000
 """Corners tried on open edges, at most: half a gigabyte. Beyond, edges stay open."""
+SIDES = 1024
+"""Open edges whose corners are counted at once."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -291,10 +293,15 @@ def _cut(faces: Ints, sides: Ints, triangles: Floats) -> tuple[Ints, Ints]:
     places = np.append(begins, ends, axis=0)[first]
     along = ends - begins
     squares = np.maximum((along**2).sum(axis=1), np.finfo(np.float64).tiny)
-    tree, balls = cKDTree(places), (0.5 * (begins + ends), 0.5 * np.sqrt(squares))
-    if tree.query_ball_point(*balls, return_length=True).sum() > MOST_NEAR:
-        return np.arange(len(sides)), sides // 3
-    near = tree.query_ball_point(*balls)
+    tree, middles, radii = cKDTree(places), 0.5 * (begins + ends), 0.5 * np.sqrt(squares)
+    tried = 0
+    for at in range(0, len(sides), SIDES):  # many long edges: a count of all takes minutes
+        some = slice(at, at + SIDES)
+        counts = tree.query_ball_point(middles[some], radii[some], return_length=True)
+        tried += int(np.sum(counts))
+        if tried > MOST_NEAR:
+            return np.arange(len(sides)), sides // 3
+    near = tree.query_ball_point(middles, radii)
     side = np.repeat(np.arange(len(sides)), [len(some) for some in near])
     corner = np.concatenate(near).astype(np.int64)
     arms = places[corner] - begins[side]

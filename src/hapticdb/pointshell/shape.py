@@ -65,25 +65,43 @@ class CollisionShape:
         """Its inside; None where it has no closed body."""
         return (Interior(self._oriented[0]) or None) if self._oriented else None
 
-    def almost_encloses(self, positions: Floats) -> NDArray[np.bool_]:
+    def almost_encloses(self, positions: Floats, by: Floats | None = None) -> NDArray[np.bool_]:
         """Whether its open surfaces, not watertight, go round positions (Q, 3): (Q,).
 
-        By winding numbers near to a whole one: a measurement, no proof.
+        By winding numbers near to a whole one, of all its open surfaces together, which cracks may
+        part, or of one alone, which others may stand beside: a measurement, no proof. by : as for
+        `moved_interior`.
         """
-        turns = winding_numbers(self._open, positions)
-        return np.asarray((np.abs(turns) > 0.5) & (np.abs(turns - np.rint(turns)) < LEAK))
+        triangles, parts, numbers, order = self._open
+        if by is not None:
+            triangles = triangles + np.take_along_axis(by[numbers], order, axis=1)
+        turns = winding_numbers(triangles, parts, positions)
+        whole, total = np.rint(turns), turns.sum(axis=1)
+        # a wall of a void, open or not, takes off what the wall around it counts
+        is_one = (whole * (np.abs(turns - whole) < LEAK)).any(axis=1) & (whole.sum(axis=1) != 0.0)
+        is_all = (np.abs(total) > 0.5) & (np.abs(total - np.rint(total)) < LEAK)
+        return np.asarray(is_one | is_all)
 
     @cached_property
-    def _open(self) -> Floats:
-        """Triangles (F, 3, 3) of its open surfaces, of one winding inwards."""
+    def _open(self) -> tuple[Floats, Ints, Ints, Ints]:
+        """Triangles (F, 3, 3) of its open surfaces, of one winding inwards.
+
+        Then the connected part (F,) and the tree's number (F,) of each, and the order (F, 3, 1) of
+        its corners.
+        """
         if self._oriented is None:
-            return self.tree.corners[:0]
-        surface = self._oriented[0]
+            none = np.empty(0, np.int64)
+            return self.tree.corners[:0], none, none, none.reshape(0, 1, 1)
+        surface, numbers = self._oriented
         is_open = surface.bodies == 0
         found, inward = surface.triangles[is_open], surface.normals[is_open]
         is_outward = (normals_of(found)[0] * inward).sum(axis=1) < 0.0
-        found[is_outward] = found[is_outward, ::-1]
-        return np.asarray(found)
+        order = np.where(is_outward[:, None], [2, 1, 0], [0, 1, 2])[:, :, None]
+        faces = self._corners[numbers[is_open]]
+        links = np.concatenate([faces[:, :2], faces[:, 1:]])
+        part = components(links, int(faces.max(initial=-1)) + 1)[faces[:, 0]]
+        part = np.unique(part, return_inverse=True)[1]
+        return np.take_along_axis(found, order, axis=1), part, numbers[is_open], order
 
     def moved_interior(self, by: Floats | None) -> Interior | None:
         """The inside after the tree's corners have moved by (T, 3, 3) metres, if they have."""

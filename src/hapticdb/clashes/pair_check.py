@@ -12,7 +12,8 @@ from hapticdb.store.base import Object, Store
 from hapticdb.store.pairs import PairRow
 from hapticdb.verdicts import Kind
 
-SETTING = re.compile(r"within (\S+) contact (\S+) by motions, holes")
+NUMBER = r"(inf|\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
+SETTING = re.compile(rf"within {NUMBER} contact {NUMBER} by motions, holes")
 """`PairQuery.setting`, read back."""
 SHARE = 1e-4
 """Tolerance of a length on another machine, a share."""

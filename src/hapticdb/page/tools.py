@@ -103,7 +103,7 @@ def from_files(
         length = float(np.ptp(vertices, axis=0).max())
         doubt = "" if unit or file.names_unit else unit_doubt(length, extent, voxel_size)
         if doubt:
-            LOG.warning("the tool %s is %s", path.name, doubt)
+            LOG.warning("hapticdb: the tool %s is %s", path.name, doubt)
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         faces = np.arange(len(vertices)).reshape(-1, 3)
         sample = partial(_centred_shell, vertices, faces, inset, file.link)

@@ -11,7 +11,7 @@ from pathlib import Path
 import costs
 import hapticdb
 from hapticdb.store.postgres.address import with_environment
-from paper.experiments import Budget, in_memory
+from paper.experiments import Budget, dense
 from paper.measure import Cell, in_turns
 from paper.subject import LAWS, Subject
 from paper.workload import Task, random_poses, slide_poses, sphere_shell
@@ -20,7 +20,7 @@ from places import Binaries, serving
 SERVER = {"max_wal_size": "4GB", "fsync": "off", "shared_buffers": "1GB"}
 
 
-def measure(url: str, name: str, budget: Budget, *, beside_bitmap: bool = True) -> list[Cell]:
+def measure(url: str, name: str, budget: Budget) -> list[Cell]:
     """Frames on one environment."""
     cells = []
     with hapticdb.open(url, read_only=True) as env:
@@ -29,15 +29,15 @@ def measure(url: str, name: str, budget: Budget, *, beside_bitmap: bool = True) 
             Task("random", shell, random_poses(env, budget.frames)),
             Task("slide", shell, slide_poses(env, shell, budget.frames)),
         ):
-            if beside_bitmap:
-                cells += [one | {"environment": name} for one in in_memory(env, [task], budget)]
             for law in LAWS:
                 cells += _of_law(subject, task, law, 4 * budget.cell_s)
     return cells
 
 
 def _of_law(subject: Subject, task: Task, law: str, limit_s: float) -> list[Cell]:
-    """Frames read by statements, and the two visits."""
+    """Frames read by statements, the two visits, and the bitmap."""
+    env, about = subject.env, {"environment": subject.name, "law": law}
+    bitmap = dense(env, task, **about, engine=env.engine)
     read = [subject.alternative(task, one, law=law) for one in ("points", "array")]
     query = subject.query()
     first = subject.alternative(task, "auto", law=law, query=query, visit="first")
@@ -47,7 +47,7 @@ def _of_law(subject: Subject, task: Task, law: str, limit_s: float) -> list[Cell
     memory = query.query._memory  # noqa: SLF001 - no user drops it
     assert memory is not None
     first.before = memory.clear
-    return in_turns([*read, first, again], task.poses, limit_s=limit_s)
+    return in_turns([*read, first, again, bitmap], task.poses, limit_s=limit_s)
 
 
 def everywhere(
@@ -66,5 +66,5 @@ def everywhere(
             for url in (str(folder / f"visits{n}.db"), on_server):
                 say(f"visits, {model.name}, {url if url == on_server else 'SQLite'}")
                 costs.imported(url, str(model.file), bits, model.extent, distances=1)
-                cells += measure(url, model.name, budget, beside_bitmap=url != on_server)
+                cells += measure(url, model.name, budget)
     return cells

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,22 +129,19 @@ def in_memory(env: Environment, tasks: Sequence[Task], budget: Budget) -> list[C
     """The same frames, called one by one, against one dense bitmap: what no database can beat."""
     cells = []
     for task in tasks:
-        with CellTable.create(RESIDENT_BYTES) as table:
-            residency = Residency(env.store, table)
-            frames = ResidentFrames(residency, task.shell, run=0)
-            frames.evaluate(task.poses)
-            bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
-        cell: Cell = {
-            "engine": "memory",
-            "layout": "dense bitmap",
-            "file": "cached",
-            "law": "plane",
-        }
-        cell |= {"strategy": "bitmap", "poses": task.name, "points": len(task.shell)}
-        cells += in_turns(
-            [Alternative(cell, _against(bitmap, frames))], task.poses, limit_s=budget.cell_s
-        )
+        cells += in_turns([dense(env, task)], task.poses, limit_s=budget.cell_s)
     return cells
+
+
+def dense(env: Environment, task: Task, **more: Any) -> Alternative:  # noqa: ANN401 - as of `Subject`
+    """Frames against a bitmap of the cells at the task's poses, under the law plane."""
+    with CellTable.create(RESIDENT_BYTES) as table:
+        frames = ResidentFrames(Residency(env.store, table), task.shell, run=0)
+        frames.evaluate(task.poses)
+        bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
+    cell: Cell = {"engine": "memory", "layout": "dense bitmap", "file": "cached", "law": "plane"}
+    cell |= {"strategy": "bitmap", "poses": task.name, "points": len(task.shell)} | more
+    return Alternative(cell, _against(bitmap, frames))
 
 
 def _against(bitmap: NDArray[np.uint32], frames: ResidentFrames) -> Callable[[Floats], Query]:

@@ -16,7 +16,6 @@ from paper.cells import (
     typical,
 )
 
-LAWS = ("plane", "distance")
 COMPARED = ("points", "statement", "array", "maxgap", "cbgroup")
 """Strategies of the claim, in the order of its columns."""
 SHOWN = (1, 32)
@@ -64,17 +63,13 @@ def claim(results: Results) -> str:
 
 def summary(results: Results) -> str:
     """The claim: microseconds of a frame under each law over all scenes and poses."""
-    cells = cells_of(results, "visits")
     lines = []
-    for (engine, law), group in grouped(cells, ("engine", "law")).items():
-        if engine == "memory":
-            continue
+    for (engine, law), group in grouped(cells_of(results, "visits"), ("engine", "law")).items():
         us: dict[str, list[float]] = {}
-        for cell in group:
-            us.setdefault(cell.get("visit", cell["strategy"]), []).append(typical(cell))
-            if cell.get("visit") == "again":
-                ratio = typical(cell) / typical(_bitmap_beside(cells, cell))
-                us.setdefault("ratio", []).append(ratio)
+        for own in grouped(group, ("environment", "poses")).values():
+            times = {cell.get("visit", cell["strategy"]): typical(cell) for cell in own}
+            for name, value in (*times.items(), ("ratio", times["again"] / times["bitmap"])):
+                us.setdefault(name, []).append(value)
         said = {name: f"{us_text(min(all_))} to {us_text(max(all_))}" for name, all_ in us.items()}
         lines.append(
             f"- {engine}, law {law}: {said['first']} us at the first visit, {said['again']} from "
@@ -83,30 +78,16 @@ def summary(results: Results) -> str:
     return "\n".join(lines)
 
 
-def _bitmap_beside(cells: Sequence[Cell], cell: Cell) -> Cell:
-    """The bitmap's frames at the poses of a cell."""
-    (found,) = (
-        one
-        for one in cells
-        if one["strategy"] == "bitmap"
-        and (one["environment"], one["poses"]) == (cell["environment"], cell["poses"])
-    )
-    return found
-
-
 def visits(results: Results) -> str:
     """Microseconds of a frame's first visit and of the next ones; the bitmap in memory."""
     rows = []
     cells = cells_of(results, "visits")
-    engines = distinct([cell for cell in cells if "visit" in cell], "engine")
-    for (where, poses), group in grouped(cells, ("environment", "poses")).items():
-        us = {(c["engine"], c["law"], c.get("visit", c["strategy"])): typical(c) for c in group}
-        bitmap = us_text(typical(_bitmap_beside(cells, group[0])))
-        for law in LAWS:
-            row = [f"{where}, {poses}, {law}", bitmap]
-            for engine in engines:
-                row += [us_text(us[engine, law, one]) for one in ("points", "first", "again")]
-            rows.append(row)
+    engines = distinct(cells, "engine")
+    for (where, poses, law), group in grouped(cells, ("environment", "poses", "law")).items():
+        us = {(c["engine"], c.get("visit", c["strategy"])): us_text(typical(c)) for c in group}
+        row = [f"{where}, {poses}, {law}", us[engines[0], "bitmap"]]
+        row += [us[engine, one] for engine in engines for one in ("points", "first", "again")]
+        rows.append(row)
     beside = [f"{one}: points" for one in engines]
     head = [text for name in beside for text in (name, "first", "again")]
     return table(["us a frame", "bitmap", *head], rows)

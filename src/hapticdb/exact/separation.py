@@ -380,6 +380,8 @@ def _contains_piece(
     corners (T, 3, 3) : of the inner one, placed by the pose or back; growth : of a ball's radius,
     metres; is_leaky : as of `is_nested`. A piece with a corner outside the body's box is not in it.
     """
+    if is_leaky and not outer.has_open:
+        return False
     reach = growth if outer_by is None else float(np.abs(outer_by).max())
     first = np.empty((len(inner.starts), 3))
     # broad phase: only pieces within the grown box are tested against the interior

@@ -83,6 +83,11 @@ class CollisionShape:
         return np.asarray(is_one | is_all)
 
     @cached_property
+    def has_open(self) -> bool:
+        """Whether some of its surfaces are open."""
+        return self._oriented is not None and not self._oriented[0].bodies.all()
+
+    @cached_property
     def _open(self) -> tuple[Floats, Ints, Ints, Ints]:
         """Triangles (F, 3, 3) of its open surfaces, of one winding inwards.
 
